@@ -1,0 +1,75 @@
+"""Array types shared by the package (jaxtyping), and the field that holds a physical parameter."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+Scalar = Float[Array, ""]
+Matrix3 = Float[Array, "3 3"]
+Vector3 = Float[Array, "3"]
+
+__all__ = [
+    "Array",
+    "Bool",
+    "Float",
+    "Int",
+    "Matrix3",
+    "Scalar",
+    "Vector3",
+    "as_float_array",
+    "concrete",
+    "is_parameter",
+    "parameter",
+    "require",
+]
+
+
+def as_float_array(value: Any) -> Array:
+    """Turn a number or an array of numbers into a strongly typed floating array.
+
+    A Python number becomes an array of the default precision, so that a new value neither
+    recompiles a jitted function nor loses its derivative. Floating arrays keep their dtype.
+    """
+    if isinstance(value, jax.Array | np.ndarray | np.generic) and jnp.issubdtype(
+        value.dtype, jnp.floating
+    ):
+        return jnp.asarray(value, dtype=value.dtype)
+    return jnp.asarray(value, dtype=jnp.zeros(()).dtype)
+
+
+def parameter(**kwargs: Any) -> Any:
+    """A field of an `eqx.Module` that holds a physical parameter.
+
+    The value is one number, or one number per particle of the material's slice.
+    """
+    return eqx.field(converter=as_float_array, metadata={"parameter": True}, **kwargs)
+
+
+def is_parameter(field: Any) -> bool:
+    """Whether a dataclass field was declared with `parameter()`."""
+    return bool(field.metadata.get("parameter", False))
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """The value as a numpy array, or None while it is being traced (jit, grad, vmap)."""
+    if isinstance(value, jax.core.Tracer):
+        return None
+    return np.asarray(value)
+
+
+def require(name: str, value: Any, rule: str, holds: Any) -> None:
+    """Raise a `ValueError` that names argument, rule and value unless `holds(value)` everywhere.
+
+    Values being traced are not checked: their errors appear in `Trajectory.status`.
+    """
+    array = concrete(value)
+    if array is None:
+        return
+    ok = np.asarray(holds(array))
+    if not np.all(ok):
+        bad = array if array.ndim == 0 else array[tuple(np.argwhere(~ok)[0])] if ok.shape else array
+        raise ValueError(f"Argument `{name}` must {rule}, but is {bad!s}.")
