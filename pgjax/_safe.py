@@ -6,7 +6,7 @@ from pgjax._types import Array, Float
 
 
 def safe_divide(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`a / b`, and 0 with zero derivative where `b == 0` (the argument is guarded, not the result)."""
+    """`a / b`, and 0 with zero derivative where `b == 0`: the argument is guarded."""
     nonzero = b != 0
     return jnp.where(nonzero, a / jnp.where(nonzero, b, 1), 0)
 

@@ -1,0 +1,136 @@
+"""The background grid: a rectangular box of nodes, fixed in space."""
+
+import math
+from collections.abc import Sequence
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pgjax._types import Array, Bool, Float, Int, as_float_array, require
+
+# Layers of nodes outside the box, so that the stencil of a particle at the edge fits.
+PAD = 2
+
+
+@final
+class Grid(eqx.Module):
+    """Nodes at `origin + i h`, `i = 0 … shape` along each direction.
+
+    Along a periodic direction node `shape` is node 0; along the others `PAD` layers of nodes are
+    added outside. A particle may be anywhere in the box and up to one cell outside of it.
+
+    Args:
+        origin: lower corner of the box, m, `(d,)`.
+        shape: number of cells along each direction, d = 2 or 3.
+        h: spacing, m.
+        periodic: which directions are periodic; by default none.
+    """
+
+    origin: Array = eqx.field(converter=as_float_array)
+    shape: tuple[int, ...] = eqx.field(static=True, converter=lambda s: tuple(int(n) for n in s))
+    h: Array = eqx.field(converter=as_float_array)
+    periodic: tuple[bool, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        origin: Sequence[float] | Array | np.ndarray,
+        shape: Sequence[int],
+        h: float | Array | np.ndarray,
+        *,
+        periodic: Sequence[bool] | None = None,
+    ):
+        self.origin = origin
+        self.shape = shape
+        self.h = h
+        self.periodic = tuple(bool(p) for p in (periodic or (False,) * len(tuple(shape))))
+
+    def __check_init__(self):
+        d = len(self.shape)
+        if d not in (2, 3):
+            raise ValueError(f"Argument `shape` must have 2 or 3 entries, but is {self.shape}.")
+        if self.origin.shape != (d,):
+            raise ValueError(
+                f"Argument `origin` must have shape ({d},) like `shape`, "
+                f"but has shape {self.origin.shape}."
+            )
+        if len(self.periodic) != d:
+            raise ValueError(f"Argument `periodic` must have {d} entries, but is {self.periodic}.")
+        require("origin", self.origin, "be finite", np.isfinite)
+        require("h", self.h, "be positive and finite (m)", lambda a: (a > 0) & np.isfinite(a))
+        if min(self.shape) < 1:
+            raise ValueError(f"Argument `shape` must be at least 1, but is {self.shape}.")
+        for n, periodic in zip(self.shape, self.periodic, strict=True):
+            if n < 4 and not periodic:
+                raise ValueError(
+                    f"Argument `shape` must be at least 4 along a direction that is not "
+                    f"periodic, but is {self.shape}."
+                )
+        if math.prod(self.padded_shape) * 4 >= 2**31:
+            raise ValueError(
+                f"Argument `shape` must give fewer than 2^29 nodes, but {self.shape} gives "
+                f"{math.prod(self.padded_shape):.3g}: choose a larger `h` or a smaller box."
+            )
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return len(self.shape)
+
+    @property
+    def padded_shape(self) -> tuple[int, ...]:
+        """Nodes of the array the kernels see, ghosts of periodic directions included."""
+        return tuple(n + 1 + 2 * PAD for n in self.shape)
+
+    @property
+    def node_shape(self) -> tuple[int, ...]:
+        """Distinct nodes: `shape` along periodic directions, padded along the others."""
+        return tuple(
+            n if periodic else m
+            for n, m, periodic in zip(self.shape, self.padded_shape, self.periodic, strict=True)
+        )
+
+    def nodes(self) -> Float[Array, "*grid d"]:
+        """Positions of the distinct nodes relative to the origin, m."""
+        axes = [
+            jnp.arange(m, dtype=self.h.dtype) - (0 if periodic else PAD)
+            for m, periodic in zip(self.node_shape, self.periodic, strict=True)
+        ]
+        return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1) * self.h
+
+    def cells(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        """A position relative to the origin in units of h, wrapped along periodic directions."""
+        xi = x / self.h
+        period = jnp.asarray(self.shape, xi.dtype)
+        wrapped = xi - period * jax.lax.stop_gradient(jnp.floor(xi / period))
+        return jnp.where(jnp.asarray(self.periodic), wrapped, xi)
+
+    def contains(self, first: Float[Array, " d"], width: int) -> Bool[Array, ""]:
+        """Whether a stencil of `width` nodes that starts at `first` fits; False for NaN."""
+        last = jnp.asarray(self.padded_shape, first.dtype) - PAD - width
+        return jnp.all((first >= -PAD) & (first <= last))
+
+    def _images(self) -> list[Int[np.ndarray, " m"] | None]:
+        """Along each periodic direction, the distinct node behind each padded one."""
+        return [
+            (np.arange(m) - PAD) % n if periodic else None
+            for n, m, periodic in zip(self.shape, self.padded_shape, self.periodic, strict=True)
+        ]
+
+    def fold(self, padded: Float[Array, "*padded c"]) -> Float[Array, "*grid c"]:
+        """Add what ghosts of periodic directions received to the nodes they stand for."""
+        for axis, image in enumerate(self._images()):
+            if image is not None:
+                moved = jnp.moveaxis(padded, axis, 0)
+                summed = jnp.zeros((self.shape[axis], *moved.shape[1:]), moved.dtype)
+                padded = jnp.moveaxis(summed.at[image].add(moved), 0, axis)
+        return padded
+
+    def unfold(self, values: Float[Array, "*grid c"]) -> Float[Array, "*padded c"]:
+        """Give the ghosts of periodic directions the values of the nodes they stand for."""
+        for axis, image in enumerate(self._images()):
+            if image is not None:
+                values = jnp.take(values, image, axis=axis)
+        return values

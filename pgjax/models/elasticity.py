@@ -1,0 +1,342 @@
+"""Elastic laws: Kirchhoff stress of one particle from `H = F − I`.
+
+Every law is isotropic, so none needs more than the eigenvectors of `B = F Fᵀ − I`, and neither
+neo-Hookean law needs even those. Working from H instead of F keeps the stress accurate to
+rounding at every strain: from F, float32 loses digits as 1e-7/strain.
+"""
+
+import abc
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from pgjax._types import Array, Matrix3, Scalar, Vector3, parameter, require
+from pgjax.linalg import cofactor, deviator, eigenbasis, spectral_map
+
+# Below these, logarithms are continued (module docstring of each law says how), so that a
+# crushed or inverted particle is pushed back instead of turning into NaN.
+SMALLEST_STRETCH = 1e-4
+SMALLEST_VOLUME_RATIO = 1e-2
+
+
+def identity(like: Matrix3) -> Matrix3:
+    """The 3×3 identity in the dtype of `like`."""
+    return jnp.eye(3, dtype=like.dtype)
+
+
+def left_strain(H: Matrix3) -> Matrix3:
+    """`B = F Fᵀ − I = H + Hᵀ + H Hᵀ`, without the cancellation of forming F."""
+    return H + H.T + H @ H.T
+
+
+def volume_change(H: Matrix3) -> Scalar:
+    """`J − 1 = tr H + (tr²H − tr H²)/2 + det H`: the invariants, without cancellation."""
+    trace = jnp.trace(H)
+    second = (trace * trace - jnp.sum(H * H.T)) / 2
+    return trace + second + jnp.sum(H[0] * cofactor(H)[0])
+
+
+def log_volume(H: Matrix3) -> tuple[Scalar, Scalar]:
+    """`log J` and `J`, continued by its tangent below `J = 1e-2`.
+
+    The continuation keeps growing as a particle inverts, so the pressure pushes it back.
+    """
+    change = volume_change(H)
+    J = 1 + change
+    regular = J > SMALLEST_VOLUME_RATIO
+    logarithm = jnp.log1p(jnp.where(regular, change, 0))
+    at = jnp.asarray(SMALLEST_VOLUME_RATIO, H.dtype)
+    return jnp.where(regular, logarithm, jnp.log(at) + (J - at) / at), J
+
+
+def principal_stretches(H: Matrix3) -> tuple[Vector3, Vector3, Matrix3]:
+    """Signed principal stretches, eigenvalues of `B = F Fᵀ − I` and their basis; no derivative.
+
+    Squaring loses the smallest stretch in float32, so below about 0.3 it is taken from
+    `J/(σ₁σ₂)`, which also gives it the sign of det F.
+
+    Returns:
+        `σ (3,)` largest first, `w = σ² − 1`, `Q (3, 3)` whose columns are the directions.
+    """
+    H = jax.lax.stop_gradient(H)
+    w, Q = eigenbasis(left_strain(H))
+    sigma = jnp.sqrt(jnp.maximum(1 + w, 0))
+    product = sigma[0] * sigma[1]
+    J = 1 + volume_change(H)
+    from_J = J / jnp.where(product > 0, product, 1)
+    small = (sigma[2] < 0.3) | (J < 0)
+    last = jnp.where(small, from_J, sigma[2])
+    sigma = sigma.at[2].set(last)
+    w = w.at[2].set(jnp.where(small, last * last - 1, w[2]))
+    return sigma, w, Q
+
+
+def _log_divided(w: Vector3, smallest: Scalar) -> Matrix3:
+    """Divided differences of `log(1 + w)`, constant below `1 + w = smallest`."""
+    clamped = jnp.maximum(w, smallest - 1)
+    a, b = clamped[:, None], clamped[None, :]
+    ratio = (a - b) / (1 + b)
+    gap = w[:, None] - w[None, :]
+    inside = (w > smallest - 1).astype(w.dtype)
+    tangent = (inside / (1 + clamped))[:, None] * jnp.ones_like(gap)
+    return jnp.where(gap == 0, tangent, jnp.log1p(ratio) / jnp.where(gap == 0, 1, gap))
+
+
+def hencky_strain(H: Matrix3) -> tuple[Matrix3, Matrix3]:
+    """Hencky strain `ε = ½ log(F Fᵀ)` as a tensor with its exact derivative, and its basis.
+
+    Stretches below 1e-4 (and inverted ones) count as 1e-4; the status reports CLAMPED.
+
+    Returns:
+        `eps (3, 3)` and `Q (3, 3)`, the directions both `eps` and `F Fᵀ` share.
+    """
+    sigma, w, Q = principal_stretches(H)
+    smallest = jnp.asarray(SMALLEST_STRETCH**2, H.dtype)
+    # An inverted direction counts as fully compressed, not by its squared stretch.
+    w = jnp.where(sigma < SMALLEST_STRETCH, jnp.minimum(w, -1), w)
+    values = jnp.log1p(jnp.maximum(w, smallest - 1)) / 2
+    return spectral_map(left_strain(H), Q, values, _log_divided(w, smallest) / 2), Q
+
+
+def stretch_minus_identity(H: Matrix3) -> Matrix3:
+    """`V − I` of the left polar decomposition `F = V R`, R a rotation also where det F ≤ 0.
+
+    `V − I = Q diag(w/(1 + σ)) Qᵀ`; divided differences of the square root: `1/(σ_i + σ_j)`.
+    """
+    sigma, w, Q = principal_stretches(H)
+    total = sigma[:, None] + sigma[None, :]
+    # σ_i + σ_j vanishes where R itself has no derivative: bounded there, finite everywhere.
+    least = jnp.asarray(jnp.finfo(H.dtype).eps, H.dtype) * jnp.maximum(sigma[0], 1e-6)
+    divided = jnp.where(total < 0, -1, 1) / jnp.maximum(jnp.abs(total), least)
+    values = jnp.where(sigma > 0, w / (1 + jnp.maximum(sigma, 0)), sigma - 1)
+    return spectral_map(left_strain(H), Q, values, divided)
+
+
+class AbstractElasticity(eqx.Module):
+    """An elastic law of one particle. A new law implements `kirchhoff` (and `energy`)."""
+
+    E: eqx.AbstractVar[Array]
+    nu: eqx.AbstractVar[Array]
+
+    def __check_init__(self):
+        require("E", self.E, "be positive and finite (Pa)", lambda a: (a > 0) & (a < float("inf")))
+        require("nu", self.nu, "be above -1", lambda a: a > -1)
+        require("nu", self.nu, "be below 0.5", lambda a: a < 0.5)
+
+    @property
+    def mu(self) -> Array:
+        """Shear modulus `E/(2(1 + ν))`, Pa."""
+        return self.E / (2 * (1 + self.nu))
+
+    @property
+    def lam(self) -> Array:
+        """Lamé's first parameter `Eν/((1 + ν)(1 − 2ν))`, Pa."""
+        return self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
+
+    @property
+    def kappa(self) -> Array:
+        """Bulk modulus `E/(3(1 − 2ν))`, Pa."""
+        return self.E / (3 * (1 - 2 * self.nu))
+
+    @abc.abstractmethod
+    def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
+        """Kirchhoff stress `τ = J σ`, Pa, from the elastic `H = Fe − I` of one particle.
+
+        `L` is the affine velocity (1/s) for laws with viscosity, `history` what the material's
+        return map carries; a purely elastic law uses neither.
+        """
+
+    def clamped(self, H: Matrix3) -> Array:
+        """Whether the law had to continue itself beyond its domain at this H."""
+        del H
+        return jnp.zeros((), bool)
+
+    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+        """Upper bound of `ρ₀ c²`, Pa: the largest eigenvalue of the spatial tangent at H.
+
+        At rest this is `max(dλ + 2μ, 2μ)`. It decides the stable time step.
+        """
+        del H
+        return jnp.maximum(dimension * self.lam + 2 * self.mu, 2 * self.mu)
+
+
+@final
+class FixedCorotated(AbstractElasticity):
+    """Fixed corotated elasticity (Stomakhin et al. 2012).
+
+    `τ = 2μ (F − R) Fᵀ + λ J (J − 1) I = 2μ (B − (V − I)) + λ J (J − 1) I`, finite for every F.
+
+    Args:
+        E: Young's modulus, Pa. One value or one per particle.
+        nu: Poisson's ratio, in (−1, 0.5).
+    """
+
+    E: Array = parameter()
+    nu: Array = parameter()
+
+    def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
+        """`τ = 2μ (b − V) + λ J (J − 1) I`, Pa."""
+        del L, history
+        change = volume_change(H)
+        pressure = self.lam * (1 + change) * change
+        shear = left_strain(H) - stretch_minus_identity(H)
+        return 2 * self.mu * shear + pressure * identity(H)
+
+    def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
+        """`μ Σ (σ − 1)² + λ/2 (J − 1)²`, J/m³ of rest volume."""
+        del history
+        V = stretch_minus_identity(H)
+        change = volume_change(H)
+        return self.mu * jnp.sum(V * V) + self.lam / 2 * change * change
+
+    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+        """`2μ s² + λ (J² + (d − 1) |J (2J − 1)|)` with the largest stretch s, Pa."""
+        sigma, _, _ = principal_stretches(H)
+        J = 1 + volume_change(H)
+        volumetric = (dimension - 1) * jnp.abs(J * (2 * J - 1)) + J * J
+        return 2 * self.mu * sigma[0] ** 2 + jnp.maximum(self.lam, 0) * volumetric
+
+
+@final
+class StVKHencky(AbstractElasticity):
+    """Saint Venant–Kirchhoff elasticity in the Hencky strain: `τ = 2μ ε + λ tr(ε) I`.
+
+    Principal stretches below 1e-4 count as 1e-4 (status CLAMPED). The acoustic modulus
+    `2μ + λ − τ_i` vanishes at a stretch of e = 2.718 (status ELLIPTICITY_LOST).
+
+    Args:
+        E: Young's modulus, Pa. One value or one per particle.
+        nu: Poisson's ratio, in (−1, 0.5).
+    """
+
+    E: Array = parameter()
+    nu: Array = parameter()
+
+    def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
+        """`τ = 2μ ε + λ tr(ε) I`, Pa."""
+        del L, history
+        eps, _ = hencky_strain(H)
+        return 2 * self.mu * eps + self.lam * jnp.trace(eps) * identity(H)
+
+    def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
+        """`μ ‖ε‖² + λ/2 tr²(ε)`, J/m³ of rest volume."""
+        del history
+        eps, _ = hencky_strain(H)
+        return self.mu * jnp.sum(eps * eps) + self.lam / 2 * jnp.trace(eps) ** 2
+
+    def _principal(self, H: Matrix3) -> tuple[Vector3, Vector3]:
+        """Principal Hencky strains and Kirchhoff stresses; no derivative."""
+        sigma, _, _ = principal_stretches(H)
+        e = jnp.log(jnp.maximum(sigma, SMALLEST_STRETCH))
+        return e, 2 * self.mu * e + self.lam * jnp.sum(e)
+
+    def clamped(self, H: Matrix3) -> Array:
+        """Whether a principal stretch is below 1e-4."""
+        sigma, _, _ = principal_stretches(H)
+        return sigma[2] < SMALLEST_STRETCH
+
+    def elliptic(self, H: Matrix3) -> Array:
+        """Whether waves still travel in every direction: `2μ + λ > max τ_i`."""
+        _, tau = self._principal(H)
+        return jnp.max(tau) < 2 * self.mu + self.lam
+
+    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+        """`μ ℓ coth(ℓ/2) + dλ + max |τ_i|`, ℓ = 2 log(σ₁/σ₃), Pa."""
+        e, tau = self._principal(H)
+        half = jnp.maximum(e[0] - e[2], 1e-3)
+        return (
+            2 * self.mu * half / jnp.tanh(half)
+            + dimension * jnp.maximum(self.lam, 0)
+            + jnp.max(jnp.abs(tau))
+        )
+
+
+@final
+class NeoHookean(AbstractElasticity):
+    """Neo-Hookean elasticity: `τ = μ (F Fᵀ − I) + λ log J I`; no decomposition.
+
+    Below J = 1e-2 the logarithm continues as its tangent, so an inverted particle is pushed back.
+
+    Args:
+        E: Young's modulus, Pa. One value or one per particle.
+        nu: Poisson's ratio, in (−1, 0.5).
+    """
+
+    E: Array = parameter()
+    nu: Array = parameter()
+
+    def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
+        """`τ = μ B + λ log J I`, Pa."""
+        del L, history
+        log_J, _ = log_volume(H)
+        return self.mu * left_strain(H) + self.lam * log_J * identity(H)
+
+    def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
+        """`μ/2 (tr B − 2 log J) + λ/2 log²J`, J/m³ of rest volume (J > 0.01)."""
+        del history
+        log_J, _ = log_volume(H)
+        return self.mu * (jnp.trace(left_strain(H)) / 2 - log_J) + self.lam / 2 * log_J**2
+
+    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+        """`μ s² + max(μ − λ log J, 0) + dλ` with the largest stretch s, Pa."""
+        log_J, J = log_volume(H)
+        sigma, _, _ = principal_stretches(H)
+        # d(log J)/d(log J) is 1; the continuation below J = 1e-2 has slope J/0.01.
+        slope = jnp.where(J > SMALLEST_VOLUME_RATIO, 1, jnp.abs(J) / SMALLEST_VOLUME_RATIO)
+        return (
+            self.mu * sigma[0] ** 2
+            + jnp.maximum(self.mu - self.lam * log_J, 0)
+            + dimension * jnp.maximum(self.lam, 0) * slope
+        )
+
+
+@final
+class DevVolNeoHookean(AbstractElasticity):
+    """Neo-Hookean elasticity split in deviatoric and volumetric parts (Yue et al. 2015).
+
+    `τ = κ/2 (J² − 1) I + μ dev(J^(−2/3) F Fᵀ)`; no decomposition. Below J = 1e-2 the factor
+    `J^(−2/3)` keeps its value at 1e-2, so the law is finite for every F.
+
+    Args:
+        E: Young's modulus, Pa. One value or one per particle.
+        nu: Poisson's ratio, in (−1, 0.5).
+    """
+
+    E: Array = parameter()
+    nu: Array = parameter()
+
+    def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
+        """`τ = κ/2 (J² − 1) I + μ dev b̄`, Pa."""
+        del L, history
+        change = volume_change(H)
+        pressure = self.kappa / 2 * change * (2 + change)
+        return pressure * identity(H) + self.mu * deviator(isochoric_strain(H))
+
+    def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
+        """`κ/2 ((J² − 1)/2 − log J) + μ/2 (tr b̄ − 3)`, J/m³ of rest volume (J > 0.01)."""
+        del history
+        log_J, _ = log_volume(H)
+        change = volume_change(H)
+        bulk = self.kappa / 2 * (change * (2 + change) / 2 - log_J)
+        return bulk + self.mu / 2 * jnp.trace(isochoric_strain(H))
+
+    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+        """The value at rest plus `dκ (J² − 1)₊ + 4μ ‖b̄ − I‖ + ‖τ‖`, Pa."""
+        change = volume_change(H)
+        J = 1 + change
+        b = isochoric_strain(H)
+        stretch = jnp.sqrt(jnp.sum(b * b))
+        tau = self.kirchhoff(H, H)
+        rest = jnp.maximum(dimension * self.lam + 2 * self.mu, 2 * self.mu)
+        growth = dimension * self.kappa * jnp.maximum(J * J - 1, 0)
+        return rest + growth + 4 * self.mu * stretch + jnp.sqrt(jnp.sum(tau * tau))
+
+
+def isochoric_strain(H: Matrix3) -> Matrix3:
+    """`b̄ − I` with `b̄ = J^(−2/3) F Fᵀ`, without cancellation at small strain."""
+    change = jnp.maximum(volume_change(H), SMALLEST_VOLUME_RATIO - 1)
+    factor = jnp.expm1(-2 / 3 * jnp.log1p(change))
+    B = left_strain(H)
+    return B + factor * (B + identity(H))

@@ -1,0 +1,328 @@
+"""Return mappings: the plastic flow of one particle, `(H_trial, history) -> (H, history)`.
+
+A plastic strain increment is a symmetric tensor with the directions of the trial state, so the
+new elastic deformation is `Fe ← exp(Δε) Fe`, written on `H = Fe − I` as `H ← H + M + M H` with
+`M = exp(Δε) − I`: no singular vectors, no cancellation, and an elastic state stays bit-identical.
+"""
+
+import abc
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from pgjax._safe import frobenius, safe_divide
+from pgjax._types import Array, Matrix3, Scalar, as_float_array, parameter, require
+from pgjax.linalg import cofactor, deviator, spectral_map
+from pgjax.models.elasticity import (
+    AbstractElasticity,
+    DevVolNeoHookean,
+    StVKHencky,
+    hencky_strain,
+    identity,
+    isochoric_strain,
+    principal_stretches,
+)
+
+_ROOT_2_3 = (2 / 3) ** 0.5
+
+
+class AbstractPlasticity(eqx.Module):
+    """A return mapping. It says which elastic law it goes with and what it remembers."""
+
+    @abc.abstractmethod
+    def return_map(
+        self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
+    ) -> tuple[Matrix3, Array | None]:
+        """Map the trial state of one particle to an admissible one."""
+
+    def goes_with(self, elasticity: AbstractElasticity) -> bool:
+        """Whether the mapping is consistent with this elastic law."""
+        return isinstance(elasticity, StVKHencky)
+
+    def initial_history(self) -> float | None:
+        """What one particle remembers at the start; None if nothing."""
+        return None
+
+
+def _expm1_map(delta: Matrix3, Q: Matrix3) -> Matrix3:
+    """`exp(Δ) − I` of a symmetric Δ whose eigenvectors are the columns of Q."""
+    d = jax.lax.stop_gradient(jnp.diagonal(Q.T @ delta @ Q))
+    gap = d[:, None] - d[None, :]
+    quotient = jnp.where(gap == 0, 1, jnp.expm1(gap) / jnp.where(gap == 0, 1, gap))
+    return spectral_map(delta, Q, jnp.expm1(d), jnp.exp(d)[None, :] * quotient)
+
+
+class AbstractHenckyPlasticity(AbstractPlasticity):
+    """A return mapping in Hencky strain: a new one implements `flow` only."""
+
+    @abc.abstractmethod
+    def flow(
+        self, eps: Matrix3, history: Array | None, elasticity: AbstractElasticity
+    ) -> tuple[Matrix3, Array, Array | None]:
+        """From the trial Hencky strain: the new one, whether it changed, and the new history."""
+
+    def return_map(
+        self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
+    ) -> tuple[Matrix3, Array | None]:
+        """`Fe ← exp(ε − ε_trial) Fe_trial`."""
+        del dt
+        trial, Q = hencky_strain(H)
+        eps, yields, history = self.flow(trial, history, elasticity)
+        M = _expm1_map(jnp.where(yields, eps - trial, 0), Q)
+        return jnp.where(yields, H + M + M @ H, H), history
+
+
+@final
+class VonMises(AbstractHenckyPlasticity):
+    """Von Mises plasticity with optional linear isotropic hardening; goes with `StVKHencky`.
+
+    `δγ = ‖ε̂‖ − τ_Y/(2μ)`; if positive, `ε ← ε − δγ ε̂/‖ε̂‖` and `τ_Y ← τ_Y + 2μ ξ δγ`.
+
+    Args:
+        yield_stress: τ_Y, Pa, in the convention `‖dev τ‖ = τ_Y` (Frobenius norm): uniaxial yield
+            at `√(3/2) τ_Y`, shear at `τ_Y/√2`. Not comparable with Herschel–Bulkley's σ_Y.
+        hardening: ξ ≥ 0. With None the material neither hardens nor remembers.
+    """
+
+    yield_stress: Array = parameter()
+    hardening: Array | None = eqx.field(
+        default=None,
+        converter=lambda a: None if a is None else as_float_array(a),
+        metadata={"parameter": True},
+    )
+
+    def __check_init__(self):
+        require("yield_stress", self.yield_stress, "be at least 0 Pa", lambda a: a >= 0)
+        if self.hardening is not None:
+            require("hardening", self.hardening, "be at least 0 and finite", _nonnegative)
+
+    def initial_history(self) -> float | None:
+        """The accumulated δγ, from which the current yield stress follows."""
+        return None if self.hardening is None else 0.0
+
+    def flow(
+        self, eps: Matrix3, history: Array | None, elasticity: AbstractElasticity
+    ) -> tuple[Matrix3, Array, Array | None]:
+        """Radial return of the deviator."""
+        tau_Y = self.yield_stress
+        if self.hardening is not None and history is not None:
+            tau_Y = tau_Y + 2 * elasticity.mu * self.hardening * history
+        shear = deviator(eps)
+        norm = frobenius(shear)
+        dgamma = norm - tau_Y / (2 * elasticity.mu)
+        yields = dgamma > 0
+        dgamma = jnp.where(yields, dgamma, 0)
+        new = eps - dgamma * safe_divide(shear, norm * jnp.ones_like(shear))
+        return new, yields, None if history is None else history + dgamma
+
+
+@final
+class DruckerPrager(AbstractHenckyPlasticity):
+    """Drucker–Prager sand (Klár et al. 2016); goes with `StVKHencky`.
+
+    `δγ = ‖ε̂‖ + α (3λ + 2μ)/(2μ) tr ε`, `α = √(2/3) 2 sin φ/(3 − sin φ)`. `tr ε > 0`: `ε ← 0`
+    (tip); `δγ ≤ 0`: unchanged; else `ε ← ε − δγ ε̂/‖ε̂‖`.
+
+    With cohesion c and volume correction v (Tampubolon et al. 2017) the mapping acts on
+    `ε′ = ε − c I + v/3 I`, `ε ← Z(ε′) + c I`, and v remembers the volume gained at the tip.
+
+    Args:
+        friction_angle: φ in degrees, in [0, 90). α matches Mohr–Coulomb in triaxial compression;
+            in plane-strain shear φ = 30° acts as 34.7°.
+        cohesion: c ≥ 0, a Hencky strain: the tip of the cone moves to `tr ε = 3c`.
+        volume_correction: whether v is remembered and returned in compression.
+    """
+
+    friction_angle: Array = parameter()
+    cohesion: Array | None = eqx.field(
+        default=None,
+        converter=lambda a: None if a is None else as_float_array(a),
+        metadata={"parameter": True},
+    )
+    volume_correction: bool = eqx.field(default=False, static=True)
+
+    def __check_init__(self):
+        require("friction_angle", self.friction_angle, "be at least 0 degrees", lambda a: a >= 0)
+        require("friction_angle", self.friction_angle, "be below 90 degrees", lambda a: a < 90)
+        if self.cohesion is not None:
+            require("cohesion", self.cohesion, "be at least 0 and finite", _nonnegative)
+
+    @property
+    def alpha(self) -> Array:
+        """Slope of the cone, `√(2/3) 2 sin φ/(3 − sin φ)`."""
+        sine = jnp.sin(jnp.deg2rad(self.friction_angle))
+        return _ROOT_2_3 * 2 * sine / (3 - sine)
+
+    def initial_history(self) -> float | None:
+        """The volume gained at the tip (log strain), if it is corrected."""
+        return 0.0 if self.volume_correction else None
+
+    def flow(
+        self, eps: Matrix3, history: Array | None, elasticity: AbstractElasticity
+    ) -> tuple[Matrix3, Array, Array | None]:
+        """Return to the cone along the deviator, or to its tip."""
+        I = identity(eps)
+        shift = jnp.zeros((), eps.dtype)
+        if self.cohesion is not None:
+            shift = shift - self.cohesion
+        if history is not None:
+            shift = shift + history / 3
+        moved = eps + shift * I
+        shear, trace = deviator(moved), jnp.trace(moved)
+        norm = frobenius(shear)
+        mu, lam = elasticity.mu, elasticity.lam
+        dgamma = norm + self.alpha * (3 * lam + 2 * mu) / (2 * mu) * trace
+        tip, cone = trace > 0, (trace <= 0) & (dgamma > 0)
+        returned = moved - dgamma * safe_divide(shear, norm * jnp.ones_like(shear))
+        new = jnp.where(tip, 0, jnp.where(cone, returned, moved))
+        if self.cohesion is not None:
+            new = new + self.cohesion * I
+        yields = tip | cone
+        if history is not None:
+            yields = yields | (history != 0)
+            history = jnp.where(yields, history + jnp.trace(eps) - jnp.trace(new), history)
+        return new, yields, history
+
+
+def _nonnegative(a: Any) -> Any:
+    return (a >= 0) & (a < float("inf"))
+
+
+def _h_or_one(h: Any) -> Array | None:
+    """None for the plain number 1, whose flow has a closed form; an array otherwise."""
+    return None if isinstance(h, int | float) and h == 1 else as_float_array(h)
+
+
+@final
+class HerschelBulkley(AbstractPlasticity):
+    """Herschel–Bulkley viscoplasticity (Yue et al. 2015); goes with `DevVolNeoHookean`.
+
+    On `s = ‖μ dev b̄‖`, `b̄ = J^(−2/3) Fe Feᵀ`, above `s_Y = √(2/3) σ_Y`: h = 1 gives
+    `s = s_tr − (s_tr − s_Y)/(1 + η/(2 μ Δt))`, other h the root of
+    `η^(1/h) (s_tr − s) = 2 μ Δt (s − s_Y)^(1/h)`. Volume is kept exactly: det b̄ = 1.
+    Steady shear at h = 1: `τ = σ_Y/√3 + (η/2) γ̇`.
+
+    Args:
+        yield_stress: σ_Y, Pa, uniaxial: yields at `‖dev τ‖ = √(2/3) σ_Y`. Not comparable with
+            the yield stress of `VonMises`.
+        viscosity: η ≥ 0, Pa·s^h. 0 is rate-independent.
+        h: exponent of the flow, > 0; below 1 shear-thinning. The plain number 1 compiles the
+            closed form; pass an array to differentiate with respect to h.
+    """
+
+    yield_stress: Array = parameter()
+    viscosity: Array = parameter()
+    h: Array | None = eqx.field(default=1, converter=_h_or_one, metadata={"parameter": True})
+
+    def __check_init__(self):
+        require("yield_stress", self.yield_stress, "be at least 0 Pa", lambda a: a >= 0)
+        require("viscosity", self.viscosity, "be at least 0 Pa s^h", lambda a: a >= 0)
+        if self.h is not None:
+            require("h", self.h, "be positive and finite", lambda a: (a > 0) & (a < float("inf")))
+
+    def goes_with(self, elasticity: AbstractElasticity) -> bool:
+        """Only with the law it is written for."""
+        return isinstance(elasticity, DevVolNeoHookean)
+
+    def flow_stress(self, s_trial: Scalar, mu: Scalar, dt: Scalar) -> Scalar:
+        """The norm s after the step from the trial norm, Pa (s_trial above s_Y)."""
+        s_Y = _ROOT_2_3 * self.yield_stress
+        excess = jnp.maximum(s_trial - s_Y, 0)
+        if self.h is None:
+            # (s_tr − s_Y) η/(η + 2 μ Δt): the printed form, finite for any η.
+            fraction = jnp.where(
+                jnp.isinf(self.viscosity),
+                1,
+                self.viscosity / (self.viscosity + 2 * mu * dt),
+            )
+            return s_Y + excess * fraction
+        return s_Y + _herschel_bulkley_excess(excess, self.viscosity, self.h, mu, dt)
+
+    def return_map(
+        self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
+    ) -> tuple[Matrix3, Array | None]:
+        """`b̄ ← S + c I` with `S = s n/μ` and det b̄ = 1; J does not change."""
+        mu = elasticity.mu
+        strain = isochoric_strain(H)
+        trial = deviator(strain)
+        norm = frobenius(trial)
+        s_trial = mu * norm
+        yields = s_trial > _ROOT_2_3 * self.yield_stress
+        s = jnp.where(yields, self.flow_stress(s_trial, mu, dt), s_trial)
+        S = (s / mu) * safe_divide(trial, norm * jnp.ones_like(trial))
+        c = _unit_determinant(S)
+        # b̄_new b̄_trial⁻¹ − I, with b̄⁻¹ = cof b̄ since det b̄ = 1; coaxial, so symmetric.
+        change = (S + c * identity(S)) - strain
+        Y = change @ cofactor(strain + identity(S))
+        Y = jnp.where(yields, (Y + Y.T) / 2, 0)
+        _, _, Q = principal_stretches(H)
+        M = _sqrt_map(Y, Q)
+        return jnp.where(yields, H + M + M @ H, H), history
+
+
+def _sqrt_map(Y: Matrix3, Q: Matrix3) -> Matrix3:
+    """`√(I + Y) − I` of a symmetric Y > −I whose eigenvectors are the columns of Q."""
+    y = jax.lax.stop_gradient(jnp.diagonal(Q.T @ Y @ Q))
+    root = jnp.sqrt(jnp.maximum(1 + y, 1e-12))
+    return spectral_map(Y, Q, y / (1 + root), 1 / (root[:, None] + root[None, :]))
+
+
+def _unit_determinant(S: Matrix3) -> Scalar:
+    """`c − 1` such that `det(S + c I) = 1` for a symmetric deviator S.
+
+    The largest root of `c³ − ½‖S‖² c + det S − 1 = 0`, by Newton from above, where the cubic is
+    convex and increasing; written for e = c − 1 it is accurate for small S. The last step is
+    differentiated, which is the implicit function theorem.
+    """
+    a = jnp.sum(S * S) / 2
+    q = jnp.sum(S[0] * cofactor(S)[0])
+
+    def newton(e: Scalar, a: Scalar, q: Scalar) -> Scalar:
+        value = e * (e * (e + 3) + 3 - a) - a + q
+        return e - value / (3 * (1 + e) ** 2 - a)
+
+    fa, fq = jax.lax.stop_gradient((a, q))
+    start = jnp.sqrt(fa) + jnp.cbrt(jnp.abs(1 - fq)) - 1
+    start = jnp.maximum(start, 0)
+    root = jax.lax.fori_loop(0, 12, lambda _, e: newton(e, fa, fq), start)
+    slope = 3 * (1 + root) ** 2 - fa
+    return root - ((root * (root * (root + 3) + 3 - a) - a + q) / slope)
+
+
+def _herschel_bulkley_excess(
+    excess: Scalar, eta: Scalar, h: Scalar, mu: Scalar, dt: Scalar
+) -> Scalar:
+    """The root u = s − s_Y of `η^(1/h) (U − u) = 2 μ Δt u^(1/h)`, 0 ≤ u ≤ U.
+
+    With `u = U z^h` it reads `1 − z^h = k z`, `k = 2 μ Δt U^(1/h − 1) / η^(1/h)`: monotone in z,
+    solved by Newton kept inside a bisection bracket. The derivative is the implicit one.
+    """
+    U = jnp.where(excess > 0, excess, 1)
+    fluid = eta > 0
+    log_k = jnp.log(2 * mu * dt) + (1 / h - 1) * jnp.log(U) - jnp.log(jnp.where(fluid, eta, 1)) / h
+
+    def residual(z: Scalar, log_k: Scalar, h: Scalar) -> Scalar:
+        return 1 - z**h - jnp.exp(log_k) * z
+
+    f_log_k, f_h = jax.lax.stop_gradient((log_k, h))
+
+    def slope(z: Scalar) -> Scalar:
+        return -f_h * z ** (f_h - 1) - jnp.exp(f_log_k)
+
+    def body(_: Array, carry: tuple) -> tuple:
+        low, high, z = carry
+        value = residual(z, f_log_k, f_h)
+        low, high = jnp.where(value > 0, z, low), jnp.where(value > 0, high, z)
+        trial = z - value / slope(z)
+        inside = (trial > low) & (trial < high)
+        return low, high, jnp.where(inside, trial, (low + high) / 2)
+
+    zero, one = jnp.zeros_like(U), jnp.ones_like(U)
+    # The root is below 1 and below 1/k.
+    start = jnp.minimum(one, jnp.exp(-f_log_k)) / 2
+    _, _, z = jax.lax.fori_loop(0, 60, body, (zero, one, start))
+    z = jax.lax.stop_gradient(jnp.maximum(z, jnp.asarray(jnp.finfo(U.dtype).tiny, U.dtype)))
+    z = z - residual(z, log_k, h) / jax.lax.stop_gradient(slope(z))
+    return jnp.where(fluid & (excess > 0), U * z**h, 0)

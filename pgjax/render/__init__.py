@@ -1,0 +1,22 @@
+"""Gaussians: reading and writing them, deforming them, drawing them.
+
+Nothing here knows the simulator: Gaussians are moved by arrays of positions and deformation
+gradients.
+"""
+
+from pgjax.render.camera import Camera as Camera
+from pgjax.render.gaussians import Gaussians as Gaussians
+from pgjax.render.gaussians import Similarity as Similarity
+from pgjax.render.gaussians import concatenate as concatenate
+from pgjax.render.gaussians import deform as deform
+from pgjax.render.media import VideoWriter as VideoWriter
+from pgjax.render.media import save_image as save_image
+from pgjax.render.media import save_video as save_video
+from pgjax.render.ply import load_ply as load_ply
+from pgjax.render.ply import save_ply as save_ply
+from pgjax.render.rasterize import Image as Image
+from pgjax.render.rasterize import render as render
+from pgjax.render.rules import RULE_3DGS as RULE_3DGS
+from pgjax.render.rules import RULE_EXACT as RULE_EXACT
+from pgjax.render.rules import RULE_GSPLAT15 as RULE_GSPLAT15
+from pgjax.render.rules import Rule as Rule

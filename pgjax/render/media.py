@@ -1,0 +1,160 @@
+"""Images and videos on disk."""
+
+import contextlib
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, final
+
+import imageio.v3 as imageio
+import imageio_ffmpeg
+import numpy as np
+from jax.typing import ArrayLike
+
+from pgjax._types import require
+from pgjax.render._files import replacing, with_suffix
+
+# Options of the encoder. Colours of .mp4 follow BT.709 and say so, else players guess by the size.
+_ENCODINGS = {
+    ".mp4": [
+        *("-vf", "scale=out_color_matrix=bt709", "-c:v", "libx264", "-crf", "18"),
+        *("-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+        *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"),
+    ],
+    # A palette for each frame: one for all would need the whole video in memory.
+    ".gif": [
+        *(
+            "-filter_complex",
+            "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1",
+        ),
+    ],
+}
+
+
+def save_image(path: str | os.PathLike[str], rgb: ArrayLike) -> None:
+    """Write a PNG. Values below 0 or above 1 are clipped.
+
+    Args:
+        path: a name that ends with .png, in an existing folder.
+        rgb: an image of shape (height, width, 3), floating, in [0, 1].
+    """
+    target = with_suffix(path, (".png",))
+    pixels = _bytes("rgb", rgb)
+    with replacing(target) as temporary:
+        imageio.imwrite(temporary, pixels)
+
+
+def save_video(
+    path: str | os.PathLike[str], frames: Iterable[ArrayLike], *, fps: float | int
+) -> None:
+    """Write frames as .mp4 or .gif; an iterator of frames is written as it is produced."""
+    with VideoWriter(path, fps=fps) as video:
+        for frame in frames:
+            video.add(frame)
+
+
+@final
+class VideoWriter:
+    """Writes a video frame by frame: `with VideoWriter(path, fps=24) as video: video.add(rgb)`.
+
+    Frames go to the encoder as they are added, into a temporary file that becomes `path` when the
+    block ends without an error. An .mp4 (H.264) needs even sizes: an odd one gains a copy of its
+    last row or column.
+
+    Args:
+        path: a name that ends with .mp4 or .gif, in an existing folder.
+        fps: frames per second. A .gif counts in hundredths of a second and is rounded to them.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, fps: float | int):
+        self._path = with_suffix(path, tuple(_ENCODINGS))
+        require("fps", fps, "be positive and finite", lambda a: (a > 0) & np.isfinite(a))
+        self._fps = float(fps)
+        self._shape: tuple[int, ...] | None = None
+        self._encoder: subprocess.Popen | None = None
+        self._messages: Any = None
+        self._temporary: Path | None = None
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "VideoWriter":
+        self._temporary = self._stack.enter_context(replacing(self._path))
+        self._messages = self._stack.enter_context(tempfile.TemporaryFile())
+        return self
+
+    def add(self, rgb: ArrayLike) -> None:
+        """Append an image of shape (height, width, 3), floating, in [0, 1] (else clipped)."""
+        if self._temporary is None:
+            raise ValueError("Frames can be added to a `VideoWriter` only inside its `with` block.")
+        pixels = _bytes("rgb", rgb)
+        if self._shape is not None and pixels.shape != self._shape:
+            raise ValueError(
+                f"Argument `rgb` must have the shape {self._shape} of the first frame, "
+                f"but has {pixels.shape}."
+            )
+        self._shape = pixels.shape
+        if self._path.suffix.lower() == ".mp4":
+            odd = [(0, size % 2) for size in pixels.shape[:2]]
+            pixels = np.pad(pixels, [*odd, (0, 0)], mode="edge")
+        if self._encoder is None:
+            self._encoder = self._start(pixels.shape[1], pixels.shape[0])
+        try:
+            self._encoder.stdin.write(pixels.tobytes())
+        except OSError as error:
+            raise RuntimeError(f"Encoding {self._path} failed: {self._log()}") from error
+
+    def _start(self, width: int, height: int) -> subprocess.Popen:
+        """The encoder, reading raw frames from a pipe."""
+        command = [
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"),
+            *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"),
+            *("-r", f"{self._fps:.6f}", "-i", "-", *_ENCODINGS[self._path.suffix.lower()]),
+            str(self._temporary),
+        ]
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=self._messages,
+            # Ctrl-C is for us: the encoder is stopped in order.
+            start_new_session=True,
+        )
+
+    def _log(self) -> str:
+        self._messages.seek(0)
+        return self._messages.read().decode(errors="replace").strip()
+
+    def __exit__(self, *error: Any) -> None:
+        # Whatever is raised inside makes `replacing` delete the temporary file.
+        with self._stack:
+            self._temporary = None
+            encoder, self._encoder = self._encoder, None
+            if encoder is not None:
+                with contextlib.suppress(OSError):
+                    encoder.stdin.close()
+                encoder.wait()
+            if error[0] is not None:
+                raise error[1]
+            if encoder is None:
+                raise ValueError(
+                    f"The video {self._path} must have at least one frame, but has none."
+                )
+            if encoder.returncode:
+                raise RuntimeError(f"Encoding {self._path} failed: {self._log()}")
+
+
+def _bytes(name: str, rgb: ArrayLike) -> np.ndarray:
+    """A floating image in [0, 1] as 8-bit numbers."""
+    image = np.asarray(rgb)
+    if image.ndim != 3 or image.shape[-1] != 3 or 0 in image.shape:
+        raise ValueError(
+            f"Argument `{name}` must have shape (height, width, 3), but has {image.shape}."
+        )
+    if not np.issubdtype(image.dtype, np.floating):
+        raise ValueError(f"Argument `{name}` must be floating in [0, 1], but is {image.dtype}.")
+    broken = np.count_nonzero(~np.isfinite(image).all(axis=-1))
+    if broken:
+        raise ValueError(f"Argument `{name}` must be finite, but {broken} pixels are not.")
+    return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)

@@ -1,0 +1,292 @@
+"""Everything that is constant in time."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pgjax._types import Array, Float, Scalar, as_float_array, concrete, parameter, require
+from pgjax.boundary import AbstractParticleCondition
+from pgjax.grid import Grid
+from pgjax.models import Material
+from pgjax.models.material import particle_axes
+from pgjax.result import Status
+from pgjax.splines import BSpline
+from pgjax.state import State
+from pgjax.transfer import AbstractScheme, SplineGradient
+
+
+@final
+class Scene(eqx.Module):
+    """A scene: grid, materials, walls, forces. Differentiate with respect to any array in it.
+
+    Args:
+        grid: the background grid.
+        materials: one material, or several; each owns a contiguous slice of the particles.
+        volumes: rest volume of each particle, m³ (m² in two dimensions), `(p,)`. The mass of a
+            particle is its material's density times this.
+        counts: number of particles of each material, in order. Not needed for one material.
+        gravity: m/s², `(d,)`; zero by default.
+        boundaries: conditions of the grid, `(x, v, t) -> v` for one node, applied in order.
+        particle_conditions: prescribed motion and pushes of particles.
+        body_force: acceleration `b(X0, t) -> (d,)` of one particle, m/s²; `X0` is needed.
+        X0: initial positions for `body_force`, m, `(p, d)`.
+        spline: interpolation, quadratic by default.
+        scheme: `SplineGradient()` (the original MPM) or `MLS()`.
+        grid_damping: γ, 1/s: grid velocities decay as `exp(−γ t)`, whatever the time step.
+        shear_damping: r, 1/s: the symmetric part of C decays as `exp(−r t)`; infinity is RPIC.
+    """
+
+    grid: Grid
+    materials: tuple[Material, ...]
+    volumes: Array
+    counts: tuple[int, ...] = eqx.field(static=True)
+    gravity: Array
+    boundaries: tuple[Callable, ...]
+    particle_conditions: tuple[AbstractParticleCondition, ...]
+    body_force: Callable | None
+    X0: Array | None
+    spline: BSpline
+    scheme: AbstractScheme
+    grid_damping: Array = parameter()
+    shear_damping: Array = parameter()
+
+    def __init__(
+        self,
+        grid: Grid,
+        materials: Material | Sequence[Material],
+        volumes: Any,
+        *,
+        counts: Sequence[int] | None = None,
+        gravity: Any = None,
+        boundaries: Sequence[Callable] = (),
+        particle_conditions: Sequence[AbstractParticleCondition] = (),
+        body_force: Callable | None = None,
+        X0: Any = None,
+        spline: BSpline | None = None,
+        scheme: AbstractScheme | None = None,
+        grid_damping: Any = 0.0,
+        shear_damping: Any = 0.0,
+    ):
+        self.grid = grid
+        self.materials = (materials,) if isinstance(materials, Material) else tuple(materials)
+        self.volumes = as_float_array(volumes)
+        self.counts = tuple(counts) if counts is not None else self.volumes.shape
+        self.gravity = jnp.zeros_like(grid.origin) if gravity is None else as_float_array(gravity)
+        self.boundaries = tuple(boundaries)
+        self.particle_conditions = tuple(particle_conditions)
+        self.body_force = body_force
+        self.X0 = None if X0 is None else as_float_array(X0)
+        self.spline = BSpline(2) if spline is None else spline
+        self.scheme = SplineGradient() if scheme is None else scheme
+        self.grid_damping = grid_damping
+        self.shear_damping = shear_damping
+
+    def __check_init__(self):
+        d, n = self.grid.dimension, self.particle_count
+        _check_shape("volumes", self.volumes, (n,))
+        if n == 0:
+            raise ValueError("Argument `volumes` must hold at least one particle, but is empty.")
+        require_entries("volumes", self.volumes, "be positive and finite", _positive)
+        if len(self.counts) != len(self.materials) or sum(self.counts) != n:
+            raise ValueError(
+                f"Argument `counts` must give the particles of each of {len(self.materials)} "
+                f"material(s), {n} in all, but is {self.counts}."
+            )
+        for material, count in zip(self.materials, self.counts, strict=True):
+            particle_axes(material, count)
+        _check_shape("gravity", self.gravity, (d,))
+        require("gravity", self.gravity, "be finite", np.isfinite)
+        for name in ("grid_damping", "shear_damping"):
+            value = getattr(self, name)
+            _check_shape(name, value, ())
+            require(name, value, "be at least 0 (1/s)", lambda a: a >= 0)
+        for condition in self.particle_conditions:
+            _check_shape("mask", condition.mask, (n,))
+        if self.body_force is not None and self.X0 is None:
+            raise ValueError("Argument `X0` must be given with `body_force`, but is None.")
+        if self.X0 is not None:
+            _check_shape("X0", self.X0, (n, d))
+
+    @property
+    def particle_count(self) -> int:
+        """Number of particles p."""
+        return self.volumes.shape[0]
+
+    @property
+    def slices(self) -> tuple[slice, ...]:
+        """The particles of each material."""
+        ends = np.cumsum(self.counts)
+        return tuple(slice(int(e) - c, int(e)) for e, c in zip(ends, self.counts, strict=True))
+
+    @property
+    def D(self) -> Array:
+        """`Σ w (x_i − x_p)(x_i − x_p)ᵀ = D I`, m²."""
+        return self.spline.moment * self.grid.h**2
+
+    @property
+    def masses(self) -> Float[Array, " p"]:
+        """Density times rest volume, kg."""
+        parts = [
+            jnp.broadcast_to(material.density, (count,))
+            for material, count in zip(self.materials, self.counts, strict=True)
+        ]
+        return jnp.concatenate(parts).astype(self.volumes.dtype) * self.volumes
+
+    @property
+    def is_plastic(self) -> bool:
+        """Whether any material flows, so that total and elastic deformation differ."""
+        return any(material.plasticity is not None for material in self.materials)
+
+    def rest_sound_speed(self) -> Scalar:
+        """`c = √(max(dλ + 2μ, 2μ)/ρ)` of the stiffest material at rest, m/s."""
+        speeds = []
+        for material in self.materials:
+            law = material.elasticity
+            modulus = jnp.maximum(self.grid.dimension * law.lam + 2 * law.mu, 2 * law.mu)
+            speeds.append(jnp.max(jnp.sqrt(modulus / material.density)))
+        return jnp.max(jnp.stack(speeds))
+
+    def elastic_limit(self, sound_speed: Scalar) -> Scalar:
+        """The sharp bound `β(s) h/c` of the time step, s."""
+        undamped = self.scheme.stable_courant(self.spline) * self.grid.h / sound_speed
+        damped = self.scheme.stable_courant(self.spline, 0.0) * self.grid.h / sound_speed
+        # RPIC keeps at least this part of the symmetric C in any step below the bound.
+        kept = jnp.exp(-self.shear_damping * undamped)
+        return damped + (undamped - damped) * jnp.where(jnp.isnan(kept), 0, kept)
+
+
+def initial_state(
+    scene: Scene,
+    x: Any,
+    v: Any = 0.0,
+    *,
+    C: Any = 0.0,
+    F: Any = None,
+    dtype: Any = None,
+) -> State:
+    """The state at the start.
+
+    Args:
+        scene: the scene.
+        x: positions, m, `(p, d)`, inside the grid.
+        v: velocities, m/s: one number, `(d,)` or `(p, d)`.
+        C: affine velocities, 1/s: 0 or `(p, d, d)`.
+        F: elastic and total deformation gradient at the start, `(p, 3, 3)`; the identity if None.
+        dtype: precision of the simulation; JAX's default float if None.
+
+    Raises:
+        ValueError: a shape is wrong, a value is not finite, or a particle is outside the grid.
+    """
+    dtype = _precision(dtype)
+    n, d = scene.particle_count, scene.grid.dimension
+    x = _array("x", x, (n, d))
+    require_entries("x", x, "be finite", np.isfinite)
+    # In the precision of the input, before anything is rounded to the simulation's.
+    position = _relative(x, scene.grid.origin)
+    _check_inside(scene, position)
+    v = jnp.broadcast_to(_array("v", v, (n, d), (d,), ()), (n, d))
+    C = jnp.broadcast_to(_array("C", C, (n, d, d), ()), (n, d, d))
+    H = jnp.zeros((n, 3, 3), dtype)
+    if F is not None:
+        F = _array("F", F, (n, 3, 3))
+        H = F - jnp.broadcast_to(jnp.eye(3, dtype=F.dtype), F.shape)
+    for name, value in (("v", v), ("C", C), ("F", H)):
+        require_entries(name, value, "be finite", np.isfinite)
+    history = tuple(
+        None if (start := m.initial_history()) is None else jnp.full((c,), start, dtype)
+        for m, c in zip(scene.materials, scene.counts, strict=True)
+    )
+    return State(
+        position=position.astype(dtype),
+        v=v.astype(dtype),
+        C=C.astype(dtype),
+        He=H.astype(dtype),
+        H=H.astype(dtype) if scene.is_plastic else None,
+        history=history,
+        alive=jnp.ones((n,), bool),
+        step=jnp.zeros((), jnp.int32),
+        status=Status.clear(),
+        origin=scene.grid.origin.astype(dtype),
+    )
+
+
+def _precision(dtype: Any) -> Any:
+    default = jnp.zeros(()).dtype
+    if dtype is None:
+        return default
+    dtype = np.dtype(dtype)
+    if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
+        raise ValueError(f"Argument `dtype` must be float32 or float64, but is {dtype}.")
+    if dtype == np.float64 and default != np.float64:
+        raise ValueError(
+            "Argument `dtype` must be float32 unless double precision is switched on "
+            '(`jax.config.update("jax_enable_x64", True)`), but is float64.'
+        )
+    return dtype
+
+
+def _relative(x: Array | np.ndarray, origin: Array) -> Array:
+    """`x − origin`, on the host in double precision where both are known."""
+    x_known, origin_known = concrete(x), concrete(origin)
+    if x_known is None or origin_known is None:
+        x = jnp.asarray(x)
+        return x - origin.astype(x.dtype)[None, :]
+    return jnp.asarray((x_known.astype(np.float64) - origin_known).astype(x_known.dtype))
+
+
+def _array(name: str, value: Any, *shapes: tuple[int, ...]) -> Array | np.ndarray:
+    """The value as a floating array of one of the given shapes."""
+    value = value if isinstance(value, jax.Array | np.ndarray) else np.asarray(value)
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        value = value.astype(jnp.zeros(()).dtype)
+    if value.shape not in shapes:
+        allowed = " or ".join(str(s) for s in shapes)
+        raise ValueError(
+            f"Argument `{name}` must have shape {allowed}, but has shape {value.shape}."
+        )
+    return value
+
+
+def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise ValueError(f"Argument `{name}` must have shape {shape}, but has shape {value.shape}.")
+
+
+def require_entries(name: str, value: Any, rule: str, holds: Callable) -> None:
+    """Like `require`, for arrays: the message names the first bad index and how many there are."""
+    array = concrete(value)
+    if array is None:
+        return
+    bad = np.argwhere(~holds(array))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise ValueError(
+            f"Argument `{name}` must {rule}, but is {array[index]!s} at index {index} "
+            f"({len(bad)} bad entries)."
+        )
+
+
+def _check_inside(scene: Scene, position: Array) -> None:
+    known, h = concrete(position), concrete(scene.grid.h)
+    if known is None or h is None:
+        return
+    free = ~np.asarray(scene.grid.periodic)
+    size = np.asarray(scene.grid.shape) * h
+    slack = 1e-6 * h
+    outside = ((known < -slack) | (known > size + slack)) & free
+    if outside.any():
+        index = int(np.argwhere(outside.any(axis=1))[0, 0])
+        raise ValueError(
+            f"Argument `x` must lie inside the grid, from {np.asarray(scene.grid.origin)} to "
+            f"{np.asarray(scene.grid.origin) + size}, but particle {index} is at "
+            f"{known[index] + np.asarray(scene.grid.origin)} "
+            f"({int(outside.any(axis=1).sum())} particles are outside)."
+        )
+
+
+def _positive(a: Any) -> Any:
+    return (a > 0) & np.isfinite(a)
