@@ -1,3 +1,20 @@
 """pgjax: a differentiable Material Point Method simulator for scenes captured as Gaussians."""
 
+from pgjax.grid import Grid as Grid
+from pgjax.result import Condition as Condition
+from pgjax.result import SimulationError as SimulationError
+from pgjax.result import SimulationWarning as SimulationWarning
+from pgjax.result import Status as Status
+from pgjax.scene import Scene as Scene
+from pgjax.scene import initial_state as initial_state
+from pgjax.simulate import Kinematics as Kinematics
+from pgjax.simulate import Trajectory as Trajectory
+from pgjax.simulate import simulate as simulate
+from pgjax.splines import BSpline as BSpline
+from pgjax.state import State as State
+from pgjax.step import step as step
+from pgjax.timestep import stable_dt as stable_dt
+from pgjax.transfer import MLS as MLS
+from pgjax.transfer import SplineGradient as SplineGradient
+
 __version__ = "0.1.0"

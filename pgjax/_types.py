@@ -32,12 +32,13 @@ def as_float_array(value: Any) -> Array:
     """Turn a number or an array of numbers into a strongly typed floating array.
 
     A Python number becomes an array of the default precision, so that a new value neither
-    recompiles a jitted function nor loses its derivative. Floating arrays keep their dtype.
+    recompiles a jitted function nor loses its derivative. Floating arrays keep their dtype,
+    except float64 where double precision is switched off.
     """
     if isinstance(value, jax.Array | np.ndarray | np.generic) and jnp.issubdtype(
         value.dtype, jnp.floating
     ):
-        return jnp.asarray(value, dtype=value.dtype)
+        return jnp.asarray(value, dtype=jax.dtypes.canonicalize_dtype(value.dtype))
     return jnp.asarray(value, dtype=jnp.zeros(()).dtype)
 
 

@@ -94,9 +94,7 @@ def _stress(scene: Scene, state: State) -> tuple[State, Stencil, Float[Array, "p
 
 def _without_nan(state: State, finite: Bool[Array, " p"]) -> State:
     """Rest values for what is not finite; only the position stays as it is, to be seen."""
-    C, He, H = (
-        None if a is None else _where(finite, a, 0) for a in (state.C, state.He, state.H)
-    )
+    C, He, H = (None if a is None else _where(finite, a, 0) for a in (state.C, state.He, state.H))
     return eqx.tree_at(
         lambda s: (s.v, s.C, s.He, s.H),
         state,

@@ -1,5 +1,6 @@
 """Strict settings for the whole suite, and the fixtures that many tests share."""
 
+import json
 import os
 import pathlib
 
@@ -43,3 +44,64 @@ def reference_data() -> pathlib.Path:
     if not folder.is_dir():
         pytest.skip(f"reference data not found at {folder} (set PGJAX_REFERENCE_DATA)")
     return folder
+
+
+@pytest.fixture
+def measure(request):
+    """`measure(case, quantity, value, below=… or above=… or within=(lo, hi))`: assert and keep.
+
+    What a run measured is printed at its end as one table: value, demand, margin.
+    """
+
+    def check(case, quantity, value, *, below=None, above=None, within=None):
+        value = float(value)
+        if within is not None:
+            low, high = within
+            ok, demand = low <= value <= high, f"in [{low:.4g}, {high:.4g}]"
+            margin = min(value - low, high - value) / (high - low)
+        elif above is not None:
+            ok, demand = value >= above, f">= {above:.3g}"
+            margin = value / above if above else value
+        else:
+            ok, demand = value <= below, f"<= {below:.3g}"
+            margin = below / value if value else float("inf")
+        row = {
+            "case": case,
+            "quantity": quantity,
+            "value": value,
+            "demand": demand,
+            "margin": margin,
+            "ok": bool(ok),
+        }
+        request.node.user_properties.append(("measured", row))
+        assert ok, f"{case}, {quantity}: {value:.4g}, demanded {demand}"
+
+    return check
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--measured", default=None, help="write what the verification measured to this JSON file"
+    )
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    rows = [
+        row
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if getattr(report, "when", "") == "call"
+        for name, row in report.user_properties
+        if name == "measured"
+    ]
+    path = config.getoption("--measured")
+    if not path or not rows:
+        return
+    rows.sort(key=lambda row: row["case"])
+    pathlib.Path(path).write_text(json.dumps(rows, indent=1) + "\n")
+    terminalreporter.section("verification")
+    for row in rows:
+        terminalreporter.write_line(
+            f"{row['case']:5} {row['quantity'][:58]:58} {row['value']:11.3e} "
+            f"{row['demand']:24} {'ok' if row['ok'] else 'FAILED'}"
+        )

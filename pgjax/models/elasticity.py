@@ -153,6 +153,11 @@ class AbstractElasticity(eqx.Module):
         del H
         return jnp.zeros((), bool)
 
+    def elliptic(self, H: Matrix3) -> Array:
+        """Whether waves travel in every direction, so that the motion is well posed."""
+        del H
+        return jnp.ones((), bool)
+
     def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
         """Upper bound of `ρ₀ c²`, Pa: the largest eigenvalue of the spatial tangent at H.
 
@@ -279,6 +284,10 @@ class NeoHookean(AbstractElasticity):
         log_J, _ = log_volume(H)
         return self.mu * (jnp.trace(left_strain(H)) / 2 - log_J) + self.lam / 2 * log_J**2
 
+    def clamped(self, H: Matrix3) -> Array:
+        """Whether the volume ratio is below 1e-2."""
+        return volume_change(H) <= SMALLEST_VOLUME_RATIO - 1
+
     def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
         """`μ s² + max(μ − λ log J, 0) + dλ` with the largest stretch s, Pa."""
         log_J, J = log_volume(H)
@@ -321,6 +330,10 @@ class DevVolNeoHookean(AbstractElasticity):
         change = volume_change(H)
         bulk = self.kappa / 2 * (change * (2 + change) / 2 - log_J)
         return bulk + self.mu / 2 * jnp.trace(isochoric_strain(H))
+
+    def clamped(self, H: Matrix3) -> Array:
+        """Whether the volume ratio is below 1e-2."""
+        return volume_change(H) <= SMALLEST_VOLUME_RATIO - 1
 
     def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
         """The value at rest plus `dκ (J² − 1)₊ + 4μ ‖b̄ − I‖ + ‖τ‖`, Pa."""

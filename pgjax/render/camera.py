@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, final
+from typing import Any, SupportsFloat, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -85,8 +85,8 @@ class Camera(eqx.Module):
         up: Triple,
         width: int,
         height: int,
-        fov_y: ArrayLike | None = None,
-        focal: ArrayLike | None = None,
+        fov_y: SupportsFloat | None = None,
+        focal: SupportsFloat | None = None,
     ) -> "Camera":
         """A camera at `eye` that sees `target` in the centre of the image.
 
@@ -122,13 +122,13 @@ class Camera(eqx.Module):
         center: Triple,
         *,
         up: Triple,
-        azimuth: ArrayLike,
-        elevation: ArrayLike,
-        radius: ArrayLike,
+        azimuth: SupportsFloat,
+        elevation: SupportsFloat,
+        radius: SupportsFloat,
         width: int,
         height: int,
-        fov_y: ArrayLike | None = None,
-        focal: ArrayLike | None = None,
+        fov_y: SupportsFloat | None = None,
+        focal: SupportsFloat | None = None,
     ) -> "Camera":
         """A camera on a sphere around `center`, looking at it.
 
@@ -184,14 +184,15 @@ def _default_float(value: np.ndarray) -> Array:
     return jnp.asarray(value, dtype=jnp.zeros(()).dtype)
 
 
-def _focal(fov_y: ArrayLike | None, focal: ArrayLike | None, height: int) -> float:
+def _focal(fov_y: SupportsFloat | None, focal: SupportsFloat | None, height: int) -> float:
     """Focal length in pixels, from itself or from the opening angle: `(h/2) / tan(fov_y/2)`."""
     if (fov_y is None) == (focal is None):
         raise ValueError(
             "Exactly one of the arguments `fov_y` and `focal` must be given, but "
             f"fov_y={fov_y} and focal={focal}."
         )
-    if fov_y is None:
+    if focal is not None:
         return float(focal)
+    assert fov_y is not None
     require("fov_y", fov_y, "be between 0 and π radians", lambda a: (a > 0) & (a < math.pi))
     return height / 2 / math.tan(float(fov_y) / 2)

@@ -56,7 +56,8 @@ def harmonics(direction: Float[Array, "3"], degree: int) -> Float[Array, " k"]:
 
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """`Y_lm` at unit vectors of shape (…, 3) in numpy; the result has shape (…, k)."""
-    return np.stack(_polynomials(*np.moveaxis(directions, -1, 0), degree), axis=-1)
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return np.stack(_polynomials(x, y, z, degree), axis=-1)
 
 
 def _directions(count: int = 32) -> np.ndarray:

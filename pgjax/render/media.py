@@ -1,13 +1,12 @@
 """Images and videos on disk."""
 
-import contextlib
 import os
 import subprocess
 import tempfile
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, final
+from typing import IO, Any, cast, final
 
 import imageio.v3 as imageio
 import imageio_ffmpeg
@@ -101,7 +100,7 @@ class VideoWriter:
         if self._encoder is None:
             self._encoder = self._start(pixels.shape[1], pixels.shape[0])
         try:
-            self._encoder.stdin.write(pixels.tobytes())
+            cast(IO[bytes], self._encoder.stdin).write(pixels.tobytes())
         except OSError as error:
             raise RuntimeError(f"Encoding {self._path} failed: {self._log()}") from error
 
@@ -132,9 +131,7 @@ class VideoWriter:
             self._temporary = None
             encoder, self._encoder = self._encoder, None
             if encoder is not None:
-                with contextlib.suppress(OSError):
-                    encoder.stdin.close()
-                encoder.wait()
+                encoder.communicate()
             if error[0] is not None:
                 raise error[1]
             if encoder is None:

@@ -104,6 +104,7 @@ def _read_header(file: Path) -> _Header:
         raise ValueError(f"The file {file} is truncated: its header has no end.")
     counts: dict[str, int] = {}
     properties: dict[str, dict[str, str]] = {}
+    name = ""
     binary = b"ascii" not in lines.split(b"element")[0]
     for line in lines.decode("ascii", errors="replace").splitlines():
         words = line.split()
@@ -113,7 +114,7 @@ def _read_header(file: Path) -> _Header:
                 properties[name] = {}
             elif words[:1] == ["property"]:
                 properties[name][words[-1]] = words[1]
-        except (IndexError, ValueError, UnboundLocalError):
+        except (IndexError, KeyError, ValueError):
             raise ValueError(f"The file {file} has a broken header line: {line!r}.") from None
     header = _Header(counts, properties)
     _require_room(file, header, len(lines) + len("end_header\n"), binary)
@@ -228,11 +229,11 @@ def _file_columns(gaussians: Gaussians) -> np.ndarray:
             gaussians.frames,
         )
     )
-    finite = np.isfinite(factors).all(axis=(1, 2))
+    finite = np.isfinite(factors).all(axis=(1, 2), keepdims=True)
     # M = U Σ Vᵀ gives A = U Σ² Uᵀ.
-    U, scales, _ = np.linalg.svd(np.where(finite[:, None, None], factors, 0.0))
-    U[:, :, 2] *= np.sign(np.linalg.det(U))[:, None]
-    scales = np.where(finite[:, None], np.maximum(scales, _MIN_SCALE), np.nan)
+    U, scales, _ = np.linalg.svd(np.where(finite, factors, 0.0))
+    U[:, :, 2] *= np.sign(np.linalg.det(U)).reshape(-1, 1)
+    scales = np.where(finite.reshape(-1, 1), np.maximum(scales, _MIN_SCALE), np.nan)
     coefficients = rotate_coefficients(sh, frames)
     rest = coefficients[:, 1:].transpose(0, 2, 1).reshape(len(means), -1)
     with np.errstate(divide="ignore"):

@@ -1,0 +1,221 @@
+"""Rollouts: many steps in one compiled program, with bounded memory in reverse mode."""
+
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pgjax._types import Array, Float, Scalar, concrete
+from pgjax.monitor import note_frame
+from pgjax.result import SimulationWarning, Status
+from pgjax.scene import Scene
+from pgjax.state import State
+from pgjax.step import step
+
+
+@final
+class Kinematics(eqx.Module):
+    """What a trajectory keeps of each frame by default: enough to deform Gaussians.
+
+    Attributes:
+        x: positions, m, `(p, d)`.
+        v: velocities, m/s, `(p, d)`.
+        F: total deformation gradients, `(p, 3, 3)`.
+    """
+
+    x: Float[Array, "*batch p d"]
+    v: Float[Array, "*batch p d"]
+    F: Float[Array, "*batch p 3 3"]
+
+
+def kinematics(state: State) -> Kinematics:
+    """The default of `simulate(save=...)`."""
+    return Kinematics(state.x, state.v, state.F)
+
+
+@final
+class Trajectory(eqx.Module):
+    """The result of a rollout.
+
+    Attributes:
+        saved: what `save` returned, stacked: entry 0 is the initial state, entry f the state
+            after f frames.
+        t: times of the entries, s, `(frames + 1,)`.
+        final: the last state; pass it to `simulate` to go on.
+        status: per condition, the first step and a count.
+    """
+
+    saved: Any
+    t: Float[Array, "*batch _"]
+    final: State
+    status: Status
+
+
+def simulate(
+    scene: Scene,
+    state: State,
+    *,
+    dt: float | Array,
+    frames: int,
+    substeps: int,
+    save: Callable[[State], Any] = kinematics,
+    progress: bool | Callable[[int, int], None] = False,
+    throw: bool = True,
+    allow_unstable: bool = False,
+) -> Trajectory:
+    """Run `frames × substeps` steps and keep `save(state)` of every frame, the first included.
+
+    The compiled program is two nested scans, checkpointed in blocks of about √(frames·substeps)
+    steps: reverse mode keeps about 2√T states, forward mode none. `jit`, `vmap`, `grad`, `jvp`
+    apply to it.
+
+    Args:
+        scene: what is constant.
+        state: where to start (`initial_state`, or `trajectory.final`).
+        dt: time step, s. It is never changed silently; see `stable_dt`.
+        frames: number of frames to run.
+        substeps: steps per frame: a frame lasts `substeps · dt`.
+        save: any function of the state whose result is stacked over frames.
+        progress: True shows a bar; a function is called as `progress(frame, frames)`.
+        throw: raise `SimulationError` when a particle was masked. Inside `jit`, `grad` or `vmap`
+            nothing can be raised: look at `trajectory.status`.
+        allow_unstable: accept a time step above the stable one.
+
+    Raises:
+        ValueError: an argument is out of range, or dt is above the stable bound at rest.
+        SimulationError: a particle left the grid or became NaN (with `throw`).
+    """
+    for name, value in (("frames", frames), ("substeps", substeps)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"Argument `{name}` must be a whole number ≥ 1, but is {value!r}.")
+    _check_particles(scene, state)
+    _check_dt(scene, dt, allow_unstable)
+    report = _meter(frames) if progress is True else progress or None
+    trajectory = _rollout(
+        scene, state, jnp.asarray(dt, state.dtype), int(frames), int(substeps), save, report
+    )
+    if throw:
+        trajectory.status.check()
+    return trajectory
+
+
+def _check_particles(scene: Scene, state: State) -> None:
+    expected = (scene.particle_count, scene.grid.dimension)
+    if state.v.shape != expected:
+        raise ValueError(
+            f"Argument `state` must hold the particles of the scene (velocities of shape "
+            f"{expected}), but holds {state.v.shape}."
+        )
+
+
+def _check_dt(scene: Scene, dt: float | Array, allow_unstable: bool) -> None:
+    """The time step against the sharp bound at rest, before anything is compiled."""
+    value = concrete(dt)
+    if value is None:
+        return
+    if value.ndim or not (np.isfinite(value) and value > 0):
+        raise ValueError(f"Argument `dt` must be positive and finite (s), but is {dt}.")
+    limit = concrete(scene.elastic_limit(scene.rest_sound_speed()))
+    if limit is None or limit.ndim:
+        return
+    ratio, suggestion = float(value) / float(limit), 0.5 * float(limit)
+    if ratio > 1 + 1e-6 and not allow_unstable:
+        raise ValueError(
+            f"Argument `dt` must be below the stable time step {float(limit):.4g} s, but is "
+            f"{float(value):.4g} s ({ratio:.2f} of it): use {suggestion:.3g} s, or pass "
+            f"`allow_unstable=True`."
+        )
+    if ratio > 0.8:
+        warnings.warn(
+            f"The time step {float(value):.4g} s is {ratio:.2f} of the stable one at rest; moving "
+            f"particles may become unstable. Recommended: {suggestion:.3g} s.",
+            SimulationWarning,
+            stacklevel=3,
+        )
+
+
+@eqx.filter_jit
+def _rollout(
+    scene: Scene,
+    state: State,
+    dt: Scalar,
+    frames: int,
+    substeps: int,
+    save: Callable[[State], Any],
+    report: Callable[[int, int], None] | None,
+) -> Trajectory:
+    """The nested scans. Frames are grouped, or divided, so that a block has about √T steps."""
+    root = math.sqrt(frames * substeps)
+
+    def frame(state: State, index: Array) -> tuple[State, Any]:
+        advance = jax.checkpoint(lambda s: step(scene, s, dt))
+        state = repeated(advance, state, substeps, block=math.ceil(root))
+        state = note_frame(scene, state, dt)
+        if report is not None:
+            jax.debug.callback(lambda i: report(int(i) + 1, frames), index)
+        return state, save(state)
+
+    first = save(state)
+    final, rest = checkpointed_scan(frame, state, frames, group=max(1, round(root / substeps)))
+    saved = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, rest)
+    t = (state.step + substeps * jnp.arange(frames + 1, dtype=jnp.int32)).astype(dt.dtype) * dt
+    return Trajectory(saved, t, final, final.status)
+
+
+def repeated(advance: Callable[[State], State], state: State, count: int, *, block: int) -> State:
+    """Apply `advance` count times; reverse mode keeps the states between blocks only."""
+    final, _ = checkpointed_scan(lambda s, _: (advance(s), None), state, count, group=block)
+    return final
+
+
+def checkpointed_scan(
+    body: Callable[[State, Array], tuple[State, Any]], state: State, count: int, *, group: int
+) -> tuple[State, Any]:
+    """`lax.scan(body, state, arange(count))`, rematerialised in groups of about `group`."""
+    group = min(group, count)
+    if group == 1 or group == count:
+        wrapped = jax.checkpoint(body) if group == 1 else body
+        return jax.lax.scan(wrapped, state, jnp.arange(count, dtype=jnp.int32))
+    group = _even_group(count, group)
+    groups = -(-count // group)
+
+    def one(state: State, index: Array) -> tuple[State, Any]:
+        if groups * group == count:
+            return body(state, index)
+        # The last group is filled up with steps that are skipped.
+        shape = jax.eval_shape(body, state, index)[1]
+        nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shape)
+        return jax.lax.cond(index < count, body, lambda s, _: (s, nothing), state, index)
+
+    @jax.checkpoint
+    def many(state: State, indices: Array) -> tuple[State, Any]:
+        return jax.lax.scan(one, state, indices)
+
+    indices = jnp.arange(groups * group, dtype=jnp.int32).reshape(groups, group)
+    final, out = jax.lax.scan(many, state, indices)
+    return final, jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], out)
+
+
+def _even_group(count: int, group: int) -> int:
+    """A divisor of count within a factor of two of `group`, if there is one; else `group`."""
+    near = [g for g in range(max(2, group // 2), 2 * group + 1) if count % g == 0]
+    return min(near, key=lambda g: abs(math.log(g / group)), default=group)
+
+
+def _meter(frames: int) -> Callable[[int, int], None]:
+    """A progress bar in a terminal or a notebook."""
+    from tqdm.auto import tqdm  # Slow to import, needed here only.
+
+    bar = tqdm(total=frames, unit="frame")
+
+    def show(frame: int, frames: int) -> None:
+        bar.update(frame - bar.n)
+        if frame >= frames:
+            bar.close()
+
+    return show
