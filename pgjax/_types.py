@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 Scalar = Float[Array, ""]
@@ -57,7 +58,7 @@ def is_parameter(field: Any) -> bool:
 
 def concrete(value: Any) -> np.ndarray | None:
     """The value as a numpy array, or None while it is being traced (jit, grad, vmap)."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return None
     return np.asarray(value)
 

@@ -29,9 +29,9 @@ class Grid(eqx.Module):
         periodic: which directions are periodic; by default none.
     """
 
-    origin: Array = eqx.field(converter=as_float_array)
-    shape: tuple[int, ...] = eqx.field(static=True, converter=lambda s: tuple(int(n) for n in s))
-    h: Array = eqx.field(converter=as_float_array)
+    origin: Array
+    shape: tuple[int, ...] = eqx.field(static=True)
+    h: Array
     periodic: tuple[bool, ...] = eqx.field(static=True)
 
     def __init__(
@@ -42,10 +42,10 @@ class Grid(eqx.Module):
         *,
         periodic: Sequence[bool] | None = None,
     ):
-        self.origin = origin
-        self.shape = shape
-        self.h = h
-        self.periodic = tuple(bool(p) for p in (periodic or (False,) * len(tuple(shape))))
+        self.origin = as_float_array(origin)
+        self.shape = tuple(int(n) for n in shape)
+        self.h = as_float_array(h)
+        self.periodic = tuple(bool(p) for p in (periodic or (False,) * len(self.shape)))
 
     def __check_init__(self):
         d = len(self.shape)

@@ -110,9 +110,13 @@ def spectral_map(A: Matrix3, Q: Matrix3, values: Vector3, divided: Matrix3) -> M
     return _spectral_map(A, jax.lax.stop_gradient(Q), values, jax.lax.stop_gradient(divided))
 
 
+def _dot(a: list[Scalar], b: list[Scalar]) -> Scalar:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 def _order_columns(g: list, v: list) -> None:
     """Sort the columns of `g` by length, largest first, turning `v` with them (det V kept)."""
-    square = [sum(x * x for x in column) for column in g]
+    square = [_dot(column, column) for column in g]
     for i, j in ((0, 1), (0, 2), (1, 2)):
         swap = square[i] < square[j]
         square[i], square[j] = (
@@ -146,8 +150,8 @@ def _hestenes_sweep(_: Array, columns: tuple[Matrix3, Matrix3]) -> tuple[Matrix3
     """Turn each pair of columns of `G = F V` (stored as rows) until they are perpendicular."""
     g, v = ([[m[j, i] for i in range(3)] for j in range(3)] for m in columns)
     for i, j, _k in _PAIRS:
-        dot = sum(x * y for x, y in zip(g[i], g[j], strict=True))
-        gap = sum(y * y for y in g[j]) - sum(x * x for x in g[i])
+        dot = _dot(g[i], g[j])
+        gap = _dot(g[j], g[j]) - _dot(g[i], g[i])
         c, s = _rotation(gap, dot)
         for m in (g, v):
             m[i], m[j] = (

@@ -1,5 +1,6 @@
 """Rollouts: many steps in one compiled program, with bounded memory in reverse mode."""
 
+import functools
 import math
 import warnings
 from collections.abc import Callable
@@ -157,7 +158,7 @@ def _rollout(
         state = repeated(advance, state, substeps, block=math.ceil(root))
         state = note_frame(scene, state, dt)
         if report is not None:
-            jax.debug.callback(lambda i: report(int(i) + 1, frames), index)
+            jax.debug.callback(functools.partial(_call, report), index, frames)
         return state, save(state)
 
     first = save(state)
@@ -205,6 +206,10 @@ def _even_group(count: int, group: int) -> int:
     """A divisor of count within a factor of two of `group`, if there is one; else `group`."""
     near = [g for g in range(max(2, group // 2), 2 * group + 1) if count % g == 0]
     return min(near, key=lambda g: abs(math.log(g / group)), default=group)
+
+
+def _call(report: Callable[[int, int], None], index: Any, frames: Any) -> None:
+    report(int(index) + 1, int(frames))
 
 
 def _meter(frames: int) -> Callable[[int, int], None]:

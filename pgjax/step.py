@@ -1,5 +1,7 @@
 """One time step of the Material Point Method, written as the algorithm reads."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -225,7 +227,7 @@ def _return_map(
         alive = state.alive[part]
         mapped, new = jax.vmap(mapping, in_axes=axes)(material, _where(alive, H[part], 0), history)
         parts.append(mapped)
-        histories.append(None if history is None else jnp.where(alive, new, history))
+        histories.append(jax.tree.map(functools.partial(jnp.where, alive), new, history))
     return jnp.concatenate(parts), tuple(histories)
 
 

@@ -145,15 +145,11 @@ def _moments(
     w: Float[Array, "k d"], dw: Float[Array, "k d"], dx: Float[Array, "k d"], window: Array
 ) -> tuple[Array, Array, Array]:
     """`Σ w g`, `Σ w g (x_i − x_p)ᵀ` and `Σ g ∇wᵀ` of one particle, direction by direction."""
-    d = w.shape[1]
-    value, first, slope = window, [None] * d, [None] * d
-    for j in range(d):
+    value, first, slope = window, list[Array](), list[Array]()
+    for j in range(w.shape[1]):
         wdx = w[:, j] * dx[:, j]
-        for i in range(j):
-            first[i] = _contract(w[:, j], first[i])
-            slope[i] = _contract(w[:, j], slope[i])
-        first[j] = _contract(wdx, value)
-        slope[j] = _contract(dw[:, j], value)
+        first = [*(_contract(w[:, j], m) for m in first), _contract(wdx, value)]
+        slope = [*(_contract(w[:, j], m) for m in slope), _contract(dw[:, j], value)]
         value = _contract(w[:, j], value)
     return value, jnp.stack(first, axis=-1), jnp.stack(slope, axis=-1)
 
