@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from pgjax._types import Bool, Float, Array, Matrix3, Scalar
+from pgjax._types import Array, Bool, Float, Matrix3, Scalar
 from pgjax.models.elasticity import principal_stretches
 from pgjax.models.material import cast, particle_axes
 from pgjax.result import Condition

@@ -174,8 +174,8 @@ def _by_material(file: SceneFile, moving: Gaussians) -> tuple[Gaussians, tuple[i
         owner[free & (True if region is None else region.contains(x))] = index
     if (owner < 0).any():
         raise SceneError(
-            f"{file.name}: {int((owner < 0).sum())} particles are in the region of no [[material]]; "
-            f"leave out `region` in the last one."
+            f"{file.name}: {int((owner < 0).sum())} particles are in the region of no "
+            f"[[material]]; leave out `region` in the last one."
         )
     counts = np.bincount(owner, minlength=len(file.materials))
     if (counts == 0).any():

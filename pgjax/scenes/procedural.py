@@ -17,7 +17,7 @@ from pgjax.render.gaussians import Gaussians
 
 POT_SPACING = 0.02
 WOOD_SPACING = 0.017
-LEAVES = 290
+LEAVES = 310
 STALK = 3
 """Gaussians of a leaf's stalk; they are followed by those of its blade."""
 
@@ -28,8 +28,8 @@ _LIGHT = np.array([0.55, -0.45, 0.70]) / np.linalg.norm([0.55, -0.45, 0.70])
 _TERRACOTTA = np.array([0.74, 0.38, 0.25])
 _SOIL = np.array([0.20, 0.13, 0.09])
 _BARK = np.array([0.50, 0.40, 0.31])
-_DARK_GREEN = np.array([0.13, 0.38, 0.14])
-_LIGHT_GREEN = np.array([0.36, 0.62, 0.20])
+_DARK_GREEN = np.array([0.14, 0.37, 0.15])
+_LIGHT_GREEN = np.array([0.37, 0.55, 0.19])
 _MIDRIB = np.array([0.66, 0.80, 0.42])
 
 
@@ -150,6 +150,7 @@ def _pot(rng: np.random.Generator) -> _Body:
     z = np.linspace(0.005, height - 0.003, layers)
     rim = z > 0.22
     radii = np.where(rim, 0.168, 0.118 + 0.035 * z / 0.22)
+    radii[[0, -1]] -= 0.008  # rounded edges
     axis = _Branch(z[:, None] * _UP, np.tile(_UP, (layers, 1)), radii)
     means, ring, layer = _sweep(axis, POT_SPACING)
     surface_of_soil, top, bottom = layers - 3, layer == layers - 1, layer == 0
@@ -162,6 +163,8 @@ def _pot(rng: np.random.Generator) -> _Body:
     normals = np.where(inner_face[:, None], -outward, outward)
     normals = np.where((top | soil_top)[:, None], _UP, normals)
     normals = np.where((bottom & (ring > 0))[:, None], -_UP, normals)
+    edge = (ring == 0) & (top | bottom)
+    normals = np.where(edge[:, None], _unit(outward + _UP * np.where(top, 1, -1)[:, None]), normals)
     surface = (ring == 0) | inner_face | top | soil_top | bottom
     albedo = np.where(wall[:, None], _TERRACOTTA, _SOIL)
     albedo = albedo * np.where(wall, 1, rng.uniform(0.75, 1.3, len(means)))[:, None]
@@ -183,7 +186,7 @@ def _grow(
     steps = length / (count - 1) * (tangents[1:] + tangents[:-1]) / 2
     points = start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     widths = radii[0] + (radii[1] - radii[0]) * t[:, 0]
-    widths[-1] *= 0.6
+    widths[-1] *= 0.55
     return _Branch(points, tangents, widths)
 
 
@@ -203,24 +206,24 @@ def _tree(rng: np.random.Generator) -> list[_Branch]:
     lean = rng.uniform(0, 2 * math.pi)
     trunk = _grow(
         np.array([0, 0, 0.14]) - 0.02 * _direction(lean, 0),
-        _direction(lean, math.radians(68)),
-        _direction(lean + math.pi, math.radians(80)),
-        0.35,
-        (0.040, 0.030),
+        _direction(lean, math.radians(60)),
+        _direction(lean + math.pi, math.radians(72)),
+        0.40,
+        (0.038, 0.030),
     )
     # A flare at the root, where the trunk leaves the soil.
     trunk.radii[:] += 0.006 * np.exp(-(((trunk.points[:, 2] - 0.24) / 0.04) ** 2))
     branches = [trunk]
-    for i in range(7):
+    for i in range(6):
         azimuth = lean + i * _GOLDEN_ANGLE + rng.uniform(-0.2, 0.2)
-        rise = i / 6
-        start = trunk.points[round((0.72 + 0.26 * rise) * (len(trunk.points) - 1))]
-        elevation = math.radians(12 + 68 * rise)
+        rise = i / 5
+        start = trunk.points[round((0.86 + 0.14 * rise) * (len(trunk.points) - 1))]
+        elevation = math.radians(16 + 62 * rise)
         bough = _grow(
             start,
             _direction(azimuth, elevation),
             _direction(azimuth, elevation + math.radians(22 * (1 - rise))),
-            rng.uniform(0.19, 0.22) + 0.06 * rise,
+            rng.uniform(0.17, 0.20) + 0.04 * rise,
             (0.025, 0.0215),
         )
         branches += [bough, *_fork(bough, azimuth, elevation, rng)]
@@ -237,7 +240,7 @@ def _fork(
         turned = azimuth + side * rng.uniform(0.75, 1.05) / math.cos(0.6 * elevation)
         first = _direction(turned, elevation - math.radians(5))
         last = _direction(turned - 0.4 * side, elevation + math.radians(15))
-        branches.append(_grow(start, first, last, rng.uniform(0.11, 0.15), (0.0215, 0.0205)))
+        branches.append(_grow(start, first, last, rng.uniform(0.11, 0.14), (0.0215, 0.0205)))
     return branches
 
 
@@ -280,7 +283,7 @@ def _buds(
     """
     lengths = np.array([len(branch.points) for branch in branches], dtype=np.float64)
     owner = np.searchsorted(np.cumsum(lengths) / lengths.sum(), (np.arange(LEAVES) + 0.5) / LEAVES)
-    along = 1 - 0.8 * rng.uniform(0, 1, LEAVES) ** 1.4
+    along = 1 - 0.8 * rng.uniform(0, 1, LEAVES) ** 1.8
     places, normals, tangents = [], [], []
     for i in range(LEAVES):
         points, frame, radii = branches[owner[i]]
@@ -289,13 +292,13 @@ def _buds(
         e1 = _unit(np.cross(frame[place], _direction(0.3, 0.2)))
         normal = math.cos(angle) * e1 + math.sin(angle) * np.cross(frame[place], e1)
         places.append(points[place] + radii[place] * normal)
-        normals.append(normal)
+        normals.append(normal if place < len(points) - 1 else 0.5 * normal)
         tangents.append(frame[place])
     places, normals, tangents = map(np.array, (places, normals, tangents))
     outward = _unit(places - [0, 0, 0.55])
     stalks = _unit(normals + 0.5 * tangents + 0.5 * outward + 0.15 * _UP)
     wander = rng.normal(0, 0.3, places.shape)
-    return places, stalks, _unit(0.7 * stalks + 0.9 * outward - 0.35 * _UP + wander)
+    return places, stalks, _unit(0.8 * stalks + 0.8 * outward - 0.1 * _UP + wander)
 
 
 def _half_width(s: np.ndarray) -> np.ndarray:
@@ -318,7 +321,7 @@ def _leaves(
     n, k = len(places), len(s)
     L, width, bend = (
         rng.uniform(low, high, (n, 1, 1))
-        for low, high in ((0.082, 0.105), (0.021, 0.026), (0.5, 1.1))
+        for low, high in ((0.082, 0.105), (0.021, 0.026), (0.4, 1.0))
     )
     up = _unit(_UP + rng.normal(0, 0.35, blades.shape) + 0.4 * _unit(places - [0, 0, 0.6]))
     across = _unit(np.cross(up, blades))[:, None]
@@ -348,7 +351,8 @@ def _leaves(
     scales = np.concatenate([np.where(stalk[:, None], 0.6 * gap, length), scales, thin], axis=-1)
     age = rng.uniform(0, 1, (n, 1, 1))
     green = _DARK_GREEN + (0.55 * age + 0.35 * s[:, None]) * (_LIGHT_GREEN - _DARK_GREEN)
-    albedo = np.where(rib[:, None], 0.6 * _MIDRIB + 0.4 * green, green)
+    green = green * rng.uniform(0.8, 1.15, (n, 1, 1))
+    albedo = np.where(rib[:, None], 0.55 * _MIDRIB + 0.45 * green, green)
     means = means + 0.001 * rib[:, None] * upward
     return _Body(
         means.reshape(-1, 3),
@@ -380,10 +384,10 @@ def _lit(body: _Body) -> Gaussians:
     normal = body.frames[..., 2]
     facing = normal @ _LIGHT
     # Seen from either side, and a little light passes through.
-    sun = np.maximum(facing, 0) + 0.3 * np.maximum(-facing, 0) * (body.gloss > 0.1)
-    sky = (0.65 + 0.35 * normal[:, 2]) * _transmittance(body.means, _UP)
-    sunlight = 0.95 * sun * _transmittance(body.means, _LIGHT)
-    light = 0.12 + 0.62 * sky[:, None] + sunlight[:, None] * np.array([1.0, 0.97, 0.88])
+    sun = np.maximum(facing + 0.25, 0) / 1.25 + 0.3 * np.maximum(-facing, 0) * (body.gloss > 0.1)
+    sky = (0.75 + 0.25 * normal[:, 2]) * _transmittance(body.means, _UP)
+    sunlight = 0.85 * sun * _transmittance(body.means, _LIGHT)
+    light = 0.25 + 0.55 * sky[:, None] + sunlight[:, None] * np.array([1.0, 0.97, 0.88])
     color = np.clip(body.albedo * light, 0.02, 1.0)
     mirror = 2 * facing[:, None] * normal - _LIGHT
     strength = (body.gloss * (0.2 + sunlight))[:, None, None] * np.ones(3)
