@@ -197,11 +197,15 @@ class FixedCorotated(AbstractElasticity):
         return self.mu * jnp.sum(V * V) + self.lam / 2 * change * change
 
     def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
-        """`2μ s² + λ (J² + (d − 1) |J (2J − 1)|)` with the largest stretch s, Pa."""
+        """`2μ s² + max(λ (J² + (d − 1) J (2J − 1)), |λ J (J − 1)|)`, s the largest stretch, Pa.
+
+        The second term is exact: its eigenvalues for expansion, for shear and for spin.
+        """
         sigma, _, _ = principal_stretches(H)
         J = 1 + volume_change(H)
-        volumetric = (dimension - 1) * jnp.abs(J * (2 * J - 1)) + J * J
-        return 2 * self.mu * sigma[0] ** 2 + jnp.maximum(self.lam, 0) * volumetric
+        expansion = self.lam * (J * J + (dimension - 1) * J * (2 * J - 1))
+        shear = jnp.abs(self.lam * J * (J - 1))
+        return 2 * self.mu * sigma[0] ** 2 + jnp.maximum(expansion, shear)
 
 
 @final
@@ -250,12 +254,11 @@ class StVKHencky(AbstractElasticity):
     def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
         """`μ ℓ coth(ℓ/2) + dλ + max |τ_i|`, ℓ = 2 log(σ₁/σ₃), Pa."""
         e, tau = self._principal(H)
-        half = jnp.maximum(e[0] - e[2], 1e-3)
-        return (
-            2 * self.mu * half / jnp.tanh(half)
-            + dimension * jnp.maximum(self.lam, 0)
-            + jnp.max(jnp.abs(tau))
-        )
+        half = e[0] - e[2]
+        # x coth x = 1 + x²/3 − …, exactly 1 at rest.
+        near = half < 1e-3
+        coth = jnp.where(near, 1 + half * half / 3, half / jnp.tanh(jnp.where(near, 1, half)))
+        return 2 * self.mu * coth + dimension * jnp.maximum(self.lam, 0) + jnp.max(jnp.abs(tau))
 
 
 @final
@@ -289,16 +292,17 @@ class NeoHookean(AbstractElasticity):
         return volume_change(H) <= SMALLEST_VOLUME_RATIO - 1
 
     def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
-        """`μ s² + max(μ − λ log J, 0) + dλ` with the largest stretch s, Pa."""
+        """`μ s² + max(c + dλ, |c|)`, `c = μ − λ log J`, with the largest stretch s, Pa.
+
+        The second term is exact: `c + dλ`, `c` and `−c` belong to expansion, shear and spin.
+        """
         log_J, J = log_volume(H)
         sigma, _, _ = principal_stretches(H)
         # d(log J)/d(log J) is 1; the continuation below J = 1e-2 has slope J/0.01.
-        slope = jnp.where(J > SMALLEST_VOLUME_RATIO, 1, jnp.abs(J) / SMALLEST_VOLUME_RATIO)
-        return (
-            self.mu * sigma[0] ** 2
-            + jnp.maximum(self.mu - self.lam * log_J, 0)
-            + dimension * jnp.maximum(self.lam, 0) * slope
-        )
+        slope = jnp.where(J > SMALLEST_VOLUME_RATIO, 1, J / SMALLEST_VOLUME_RATIO)
+        c = self.mu - self.lam * log_J
+        spread = jnp.maximum(c + dimension * self.lam * slope, jnp.abs(c))
+        return self.mu * sigma[0] ** 2 + spread
 
 
 @final
@@ -336,15 +340,20 @@ class DevVolNeoHookean(AbstractElasticity):
         return volume_change(H) <= SMALLEST_VOLUME_RATIO - 1
 
     def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
-        """The value at rest plus `dκ (J² − 1)₊ + 4μ ‖b̄ − I‖ + ‖τ‖`, Pa."""
-        change = volume_change(H)
-        J = 1 + change
-        b = isochoric_strain(H)
-        stretch = jnp.sqrt(jnp.sum(b * b))
-        tau = self.kirchhoff(H, H)
-        rest = jnp.maximum(dimension * self.lam + 2 * self.mu, 2 * self.mu)
-        growth = dimension * self.kappa * jnp.maximum(J * J - 1, 0)
-        return rest + growth + 4 * self.mu * stretch + jnp.sqrt(jnp.sum(tau * tau))
+        """`μ (t + (√(2/3) + 2/√3) ‖dev b̄‖) + max(c + d k, |c|)`, Pa.
+
+        With `t = tr(b̄)/3` the tangent is `L ↦ μ L b̄ − ⅔ μ (tr L dev b̄ + (dev b̄ : L) I)` plus
+        `c Lᵀ + k tr L I`, `c = μ t − κ/2 (J² − 1)`, `k = κ J² − ⅔ μ t`; the last two are exact,
+        the largest eigenvalue of b̄ is at most `t + √(2/3) ‖dev b̄‖`.
+        """
+        J = 1 + volume_change(H)
+        strain = isochoric_strain(H)
+        t = 1 + jnp.trace(strain) / 3
+        shear = jnp.sqrt(jnp.sum(deviator(strain) ** 2))
+        c = self.mu * t - self.kappa / 2 * (J * J - 1)
+        k = self.kappa * J * J - 2 / 3 * self.mu * t
+        spread = jnp.maximum(c + dimension * k, jnp.abs(c))
+        return self.mu * (t + ((2 / 3) ** 0.5 + 2 / 3**0.5) * shear) + spread
 
 
 def isochoric_strain(H: Matrix3) -> Matrix3:

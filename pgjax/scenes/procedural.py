@@ -5,7 +5,7 @@ Lengths are in metres and z points up.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,19 +15,23 @@ from scipy.spatial.transform import Rotation
 
 from pgjax.render.gaussians import Gaussians
 
-POT_SPACING = 0.02
-WOOD_SPACING = 0.017
-LEAVES = 310
-STALK = 3
-"""Gaussians of a leaf's stalk; they are followed by those of its blade."""
+_POT_SPACING = 0.02
+_WOOD_SPACING = 0.017
+_LEAVES = 310
+# One leaf: Gaussians of the stalk, of the midrib, of the left and right half, and of the tip, with
+# their place along the blade (0 … 1) and side of it.
+_STALK, _RIB = 3, 4
+_LEAF_PAIRS = np.repeat([0.17, 0.37, 0.57, 0.77], 2)
+_LEAF_S = np.array([0, 0, 0, 0.08, 0.28, 0.48, 0.68, *_LEAF_PAIRS, 0.93])
+_LEAF_SIDE = np.array([0] * 7 + [-1, 1] * 4 + [0])
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 _UP = np.array([0.0, 0.0, 1.0])
 _LIGHT = np.array([0.55, -0.45, 0.70]) / np.linalg.norm([0.55, -0.45, 0.70])
 
-_TERRACOTTA = np.array([0.74, 0.38, 0.25])
+_TERRACOTTA = np.array([0.70, 0.37, 0.25])
 _SOIL = np.array([0.20, 0.13, 0.09])
-_BARK = np.array([0.50, 0.40, 0.31])
+_BARK = np.array([0.54, 0.44, 0.34])
 _DARK_GREEN = np.array([0.14, 0.37, 0.15])
 _LIGHT_GREEN = np.array([0.37, 0.55, 0.19])
 _MIDRIB = np.array([0.66, 0.80, 0.42])
@@ -50,13 +54,17 @@ class _Branch(NamedTuple):
     tangents: np.ndarray
     radii: np.ndarray
 
+    def at(self, fraction: float) -> np.ndarray:
+        """The point at a fraction of the length."""
+        return self.points[round(fraction * (len(self.points) - 1))]
+
 
 def ficus(seed: int = 0) -> Gaussians:
-    """A potted ficus one metre high on the plane z = 0, of some 8000 Gaussians.
+    """A potted ficus one metre high on the plane z = 0, of some 9000 Gaussians.
 
     Pot, soil and wood are filled solids; leaves are blades of flat Gaussians on stalks. A sun from
     one side and the sky are baked into the colours, with a faint gloss in the harmonics of degree
-    1. The Gaussians of the pot come first, then soil, wood and leaves.
+    1. The Gaussians of the pot and its soil come first, then those of the wood and the leaves.
 
     Args:
         seed: decides the shape of the tree and the place of its leaves.
@@ -64,9 +72,12 @@ def ficus(seed: int = 0) -> Gaussians:
     rng = np.random.default_rng(seed)
     branches = _tree(rng)
     pot = _pot(rng)
-    pot = _select(pot, _depth_inside(pot.means, branches) < 0.3 * WOOD_SPACING)
+    pot = _select(pot, _depth_inside(pot.means, branches) < 0.3 * _WOOD_SPACING)
     leaves = _leaves(*_buds(branches[1:], rng), rng)
-    return _lit(_fit_height(_join([pot, _wood(branches, rng), leaves])))
+    body = _Body(*_join([pot, _wood(branches, rng), leaves]))
+    # A few per cent larger or smaller, for a height of exactly one metre.
+    height = body.means[:, 2].max()
+    return _lit(body._replace(means=body.means / height, scales=body.scales / height))
 
 
 MODELS = {"ficus": ficus}
@@ -78,20 +89,14 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _join(bodies: Sequence[_Body]) -> _Body:
-    """All Gaussians of several bodies."""
-    return _Body(*(np.concatenate(parts) for parts in zip(*bodies, strict=True)))
+def _join(records: Sequence[tuple]) -> Iterator[np.ndarray]:
+    """The fields of several records, each in one array."""
+    return (np.concatenate(fields) for fields in zip(*records, strict=True))
 
 
 def _select(body: _Body, kept: np.ndarray) -> _Body:
     """The Gaussians that a mask selects."""
     return _Body(*(part[kept] for part in body))
-
-
-def _fit_height(body: _Body) -> _Body:
-    """The body enlarged or shrunk by a few per cent, so that its highest Gaussian is at z = 1."""
-    factor = 1 / body.means[:, 2].max()
-    return body._replace(means=factor * body.means, scales=factor * body.scales)
 
 
 def _frames(normals: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -101,37 +106,26 @@ def _frames(normals: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 def _disk(radius: float, spacing: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points that fill a disk, on rings from the edge inwards.
-
-    Returns the points (n, 2) and the number of the ring of each, 0 at the edge.
-    """
+    """Points (n, 2) that fill a disk on rings from its edge inwards, and the ring of each."""
     points, rings = [], []
-    for ring in range(math.ceil(radius / spacing)):
-        r = radius - ring * spacing
-        count = max(round(2 * math.pi * r / spacing), 1) if r > 0.4 * spacing else 1
+    for ring, r in enumerate(np.arange(radius, 0, -spacing)):
+        count = round(2 * math.pi * r / spacing) if r > 0.4 * spacing else 1
         angle = 2 * math.pi * (np.arange(count) + turn) / count
-        r = r if count > 1 else 0.0
-        points.append(r * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+        points.append((count > 1) * r * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
         rings.append(np.full(count, ring))
     return np.concatenate(points), np.concatenate(rings)
 
 
 def _sweep(branch: _Branch, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that fill a branch, a disk at each of its places.
-
-    Returns the points (n, 3), the number of the ring and the number of the place of each.
-    """
+    """Points (n, 3) that fill a branch disk by disk, and the ring and the place of each."""
     first = np.eye(3)[np.argmin(np.abs(branch.tangents.mean(axis=0)))]
     e1 = _unit(np.cross(branch.tangents, first))
     e2 = np.cross(branch.tangents, e1)
-    points, rings, places = [], [], []
-    for i, radius in enumerate(branch.radii):
-        # Half a turn more in every second disk staggers the points, which closes the surface best.
-        disk, ring = _disk(radius, spacing, i % 2 / 2)
-        points.append(branch.points[i] + disk[:, :1] * e1[i] + disk[:, 1:] * e2[i])
-        rings.append(ring)
-        places.append(np.full(len(ring), i))
-    return np.concatenate(points), np.concatenate(rings), np.concatenate(places)
+    # Half a turn more in every second disk staggers the points, which closes the surface best.
+    disks = [_disk(radius, spacing, i % 2 / 2) for i, radius in enumerate(branch.radii)]
+    place = np.repeat(np.arange(len(disks)), [len(ring) for _, ring in disks])
+    disk, ring = _join(disks)
+    return branch.points[place] + disk[:, :1] * e1[place] + disk[:, 1:] * e2[place], ring, place
 
 
 def _solid(
@@ -146,101 +140,71 @@ def _solid(
 
 def _pot(rng: np.random.Generator) -> _Body:
     """A tapered pot with a rim, two rings thick, filled with soil to below the rim."""
-    height, layers = 0.28, 15
-    z = np.linspace(0.005, height - 0.003, layers)
-    rim = z > 0.22
-    radii = np.where(rim, 0.168, 0.118 + 0.035 * z / 0.22)
+    layers = 15
+    z = np.linspace(0.005, 0.277, layers)
+    radii = np.where(z > 0.22, 0.168, 0.118 + 0.035 * z / 0.22)
     radii[[0, -1]] -= 0.008  # rounded edges
     axis = _Branch(z[:, None] * _UP, np.tile(_UP, (layers, 1)), radii)
-    means, ring, layer = _sweep(axis, POT_SPACING)
-    surface_of_soil, top, bottom = layers - 3, layer == layers - 1, layer == 0
+    means, ring, layer = _sweep(axis, _POT_SPACING)
+    bottom, top, above_soil = layer == 0, layer == layers - 1, layer > layers - 3
     wall = (ring < 2) | bottom
-    kept = wall | (layer <= surface_of_soil)
-    soil_top = ~wall & (layer == surface_of_soil)
+    ground = ~wall & (layer == layers - 3)
+    inside = (ring == 1) & above_soil
 
-    outward = _unit(means * [1, 1, 0] + 1e-9 * np.array([1, 0, 0]))
-    inner_face = (ring == 1) & (layer > surface_of_soil)
-    normals = np.where(inner_face[:, None], -outward, outward)
-    normals = np.where((top | soil_top)[:, None], _UP, normals)
-    normals = np.where((bottom & (ring > 0))[:, None], -_UP, normals)
-    edge = (ring == 0) & (top | bottom)
-    normals = np.where(edge[:, None], _unit(outward + _UP * np.where(top, 1, -1)[:, None]), normals)
-    surface = (ring == 0) | inner_face | top | soil_top | bottom
-    albedo = np.where(wall[:, None], _TERRACOTTA, _SOIL)
-    albedo = albedo * np.where(wall, 1, rng.uniform(0.75, 1.3, len(means)))[:, None]
-    # Lumps on the soil, and shifts inside it against a too regular lattice.
-    shift = np.where(wall[:, None], 0, rng.uniform(-0.004, 0.004, means.shape))
-    body = _solid(means + shift, normals, surface, POT_SPACING, albedo)
-    # The pot before the soil.
-    order = np.argsort(~wall, kind="stable")
-    return _select(body, order[kept[order]])
+    # Outwards on the side, inwards on its inner face, up or down elsewhere, and between at edges.
+    vertical = 1.0 * (top | ground) - bottom
+    horizontal = np.where(ring == 0, 1, np.where(vertical != 0, 0, 1 - 2 * inside))
+    outward = _unit(means * [1, 1, 0] + [1e-9, 0, 0])
+    normals = _unit(horizontal[:, None] * outward + vertical[:, None] * _UP)
+    surface = (ring == 0) | inside | (vertical != 0)
+    # The soil is uneven in colour, and shifted against a too regular lattice.
+    tone = np.where(wall, 1, rng.uniform(0.75, 1.3, len(means)))[:, None]
+    means = means + np.where(wall[:, None], 0, rng.uniform(-0.004, 0.004, means.shape))
+    albedo = tone * np.where(wall[:, None], _TERRACOTTA, _SOIL)
+    return _select(_solid(means, normals, surface, _POT_SPACING, albedo), wall | ~above_soil)
 
 
 def _grow(
-    start: np.ndarray, first: np.ndarray, last: np.ndarray, length: float, radii: tuple
+    start: np.ndarray, directions: Sequence[np.ndarray], length: float, radii: tuple[float, float]
 ) -> _Branch:
-    """A branch from `start` whose direction turns from `first` to `last`, with a rounded tip."""
-    count = max(round(length / WOOD_SPACING), 2) + 1
+    """A branch from `start` whose direction and radius turn from one to the other value."""
+    count = max(round(length / _WOOD_SPACING), 2) + 1
     t = np.linspace(0, 1, count)[:, None]
-    tangents = _unit((1 - t) * _unit(first) + t * _unit(last))
+    tangents = _unit((1 - t) * directions[0] + t * directions[1])
     steps = length / (count - 1) * (tangents[1:] + tangents[:-1]) / 2
     points = start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     widths = radii[0] + (radii[1] - radii[0]) * t[:, 0]
-    widths[-1] *= 0.55
+    widths[-1] *= 0.55  # a rounded tip
     return _Branch(points, tangents, widths)
 
 
-def _direction(azimuth: float, elevation: float) -> np.ndarray:
-    """The unit vector of two angles in radians."""
-    return np.array(
-        [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ]
-    )
+def _direction(azimuth: float, degrees: float) -> np.ndarray:
+    """The unit vector of an azimuth in radians and an elevation in degrees."""
+    return _unit(np.array([math.cos(azimuth), math.sin(azimuth), math.tan(math.radians(degrees))]))
 
 
 def _tree(rng: np.random.Generator) -> list[_Branch]:
     """The trunk first, rooted in the soil; then its boughs, and two branches from each of them."""
     lean = rng.uniform(0, 2 * math.pi)
-    trunk = _grow(
-        np.array([0, 0, 0.14]) - 0.02 * _direction(lean, 0),
-        _direction(lean, math.radians(60)),
-        _direction(lean + math.pi, math.radians(72)),
-        0.40,
-        (0.038, 0.030),
-    )
-    # A flare at the root, where the trunk leaves the soil.
+    ends = (_direction(lean, 60), _direction(lean + math.pi, 72))
+    root = np.array([0, 0, 0.14]) - 0.02 * _direction(lean, 0)
+    trunk = _grow(root, ends, 0.40, (0.038, 0.030))
+    # A flare where the trunk leaves the soil.
     trunk.radii[:] += 0.006 * np.exp(-(((trunk.points[:, 2] - 0.24) / 0.04) ** 2))
     branches = [trunk]
-    for i in range(6):
+    for i, rise in enumerate(np.linspace(0, 1, 6)):
         azimuth = lean + i * _GOLDEN_ANGLE + rng.uniform(-0.2, 0.2)
-        rise = i / 5
-        start = trunk.points[round((0.86 + 0.14 * rise) * (len(trunk.points) - 1))]
-        elevation = math.radians(16 + 62 * rise)
-        bough = _grow(
-            start,
-            _direction(azimuth, elevation),
-            _direction(azimuth, elevation + math.radians(22 * (1 - rise))),
-            rng.uniform(0.17, 0.20) + 0.04 * rise,
-            (0.025, 0.0215),
-        )
-        branches += [bough, *_fork(bough, azimuth, elevation, rng)]
-    return branches
-
-
-def _fork(
-    bough: _Branch, azimuth: float, elevation: float, rng: np.random.Generator
-) -> list[_Branch]:
-    """Two branches that leave a bough to the left and to the right."""
-    branches = []
-    for side, place in ((-1, 0.5), (1, 0.72)):
-        start = bough.points[round(place * (len(bough.points) - 1))]
-        turned = azimuth + side * rng.uniform(0.75, 1.05) / math.cos(0.6 * elevation)
-        first = _direction(turned, elevation - math.radians(5))
-        last = _direction(turned - 0.4 * side, elevation + math.radians(15))
-        branches.append(_grow(start, first, last, rng.uniform(0.11, 0.14), (0.0215, 0.0205)))
+        elevation = 16 + 62 * rise
+        ends = (_direction(azimuth, elevation), _direction(azimuth, 38 + 40 * rise))
+        length = rng.uniform(0.17, 0.20) + 0.04 * rise
+        bough = _grow(trunk.at(0.86 + 0.14 * rise), ends, length, (0.025, 0.0215))
+        branches.append(bough)
+        for side, place in ((-1, 0.5), (1, 0.72)):
+            turn = side * rng.uniform(0.75, 1.05) / math.cos(math.radians(0.6 * elevation))
+            first = _direction(azimuth + turn, elevation - 5)
+            last = _direction(azimuth + turn - 0.4 * side, elevation + 15)
+            length = rng.uniform(0.11, 0.14)
+            branches.append(_grow(bough.at(place), (first, last), length, (0.0215, 0.0205)))
     return branches
 
 
@@ -257,21 +221,22 @@ def _wood(branches: Sequence[_Branch], rng: np.random.Generator) -> _Body:
     """Filled branches; what lies inside an earlier one, or too near to its points, is left out."""
     bodies, earlier = [], np.empty((0, 3))
     for i, branch in enumerate(branches):
-        means, ring, place = _sweep(branch, WOOD_SPACING)
-        kept = _depth_inside(means, branches[:i]) < 0.2 * WOOD_SPACING
+        means, ring, place = _sweep(branch, _WOOD_SPACING)
+        kept = _depth_inside(means, branches[:i]) < 0.2 * _WOOD_SPACING
         if len(earlier):
-            kept &= cKDTree(earlier).query(means)[0] > 0.55 * WOOD_SPACING
+            kept &= cKDTree(earlier).query(means)[0] > 0.55 * _WOOD_SPACING
         normals = means - branch.points[place] + 1e-6 * branch.tangents[place]
         tip = place == len(branch.points) - 1
         normals = _unit(_unit(normals) + np.where(tip[:, None], branch.tangents[place], 0))
-        # Bark: darker and lighter bands around the wood.
-        tone = rng.uniform(0.9, 1.1, len(branch.points))[place] * rng.uniform(
-            0.93, 1.07, len(means)
-        )
-        body = _solid(means, normals, (ring == 0) | tip, WOOD_SPACING, _BARK * tone[:, None])
+        # Bark in darker and lighter bands, and green towards the tips of the branches.
+        bands = rng.uniform(0.9, 1.1, len(branch.points))[place]
+        tone = bands * rng.uniform(0.93, 1.07, len(means))
+        young = (i > 0) * 0.6 * (place / place.max())[:, None]
+        albedo = tone[:, None] * ((1 - young) * _BARK + young * _DARK_GREEN)
+        body = _solid(means, normals, (ring == 0) | tip, _WOOD_SPACING, albedo)
         bodies.append(_select(body, kept))
         earlier = np.concatenate([earlier, means[kept]])
-    return _join(bodies)
+    return _Body(*_join(bodies))
 
 
 def _buds(
@@ -281,29 +246,22 @@ def _buds(
 
     They go around each branch by the golden angle, as leaves do, and are denser near its tip.
     """
-    lengths = np.array([len(branch.points) for branch in branches], dtype=np.float64)
-    owner = np.searchsorted(np.cumsum(lengths) / lengths.sum(), (np.arange(LEAVES) + 0.5) / LEAVES)
-    along = 1 - 0.8 * rng.uniform(0, 1, LEAVES) ** 1.8
-    places, normals, tangents = [], [], []
-    for i in range(LEAVES):
-        points, frame, radii = branches[owner[i]]
-        place = round(along[i] * (len(points) - 1))
-        angle = i * _GOLDEN_ANGLE
-        e1 = _unit(np.cross(frame[place], _direction(0.3, 0.2)))
-        normal = math.cos(angle) * e1 + math.sin(angle) * np.cross(frame[place], e1)
-        places.append(points[place] + radii[place] * normal)
-        normals.append(normal if place < len(points) - 1 else 0.5 * normal)
-        tangents.append(frame[place])
-    places, normals, tangents = map(np.array, (places, normals, tangents))
+    points, tangents, radii = _join(branches)
+    counts = np.array([len(branch.points) for branch in branches])
+    ends = np.cumsum(counts)
+    number = np.arange(_LEAVES)
+    owner = np.searchsorted(ends, (number + 0.5) / _LEAVES * ends[-1])
+    from_tip = np.rint(0.8 * rng.uniform(0, 1, _LEAVES) ** 1.8 * (counts[owner] - 1)).astype(int)
+    place, angle = ends[owner] - 1 - from_tip, number[:, None] * _GOLDEN_ANGLE
+    e1 = _unit(np.cross(tangents[place], [0.9, 0.4, 0.0]))
+    normals = np.cos(angle) * e1 + np.sin(angle) * np.cross(tangents[place], e1)
+    places = points[place] + radii[place, None] * normals
     outward = _unit(places - [0, 0, 0.55])
-    stalks = _unit(normals + 0.5 * tangents + 0.5 * outward + 0.15 * _UP)
+    # At the tip of a branch stalks go on along it.
+    sideways = np.where(from_tip[:, None] > 0, 1, 0.5) * normals
+    stalks = _unit(sideways + 0.5 * tangents[place] + 0.5 * outward + 0.15 * _UP)
     wander = rng.normal(0, 0.3, places.shape)
     return places, stalks, _unit(0.8 * stalks + 0.8 * outward - 0.1 * _UP + wander)
-
-
-def _half_width(s: np.ndarray) -> np.ndarray:
-    """Half the width of a blade at the fraction s of its length, over its greatest value."""
-    return np.sin(math.pi * s**0.75)
 
 
 def _leaves(
@@ -311,56 +269,47 @@ def _leaves(
 ) -> _Body:
     """Leaves: a stalk, then pairs of disks left and right of a light midrib on a blade bent down.
 
-    The blade is an arc in the plane of its direction d and normal n: with the curvature κ over its
-    length L it is at `L (d sin(κ s) − n (1 − cos(κ s))) / κ` for s in [0, 1].
+    The blade is an arc in the plane of its direction d and normal n: with the angle β over its
+    length L it is at `L (d sin(β s) − n (1 − cos(β s))) / β` for s in [0, 1]. The width of each
+    half is proportional to `w(s) = s (1 − s) (2 − s)`: round at the stalk, pointed at the tip.
     """
-    # One leaf: position along the blade and side of it; stalk first, the tip last.
-    s = np.array([0, 0, 0, 0.08, 0.28, 0.48, 0.68, *np.repeat([0.17, 0.37, 0.57, 0.77], 2), 0.93])
-    side = np.array([0, 0, 0, 0, 0, 0, 0, *[-1, 1] * 4, 0])
-    stalk, rib = np.arange(len(s)) < STALK, np.arange(len(s)) < 7
-    n, k = len(places), len(s)
-    L, width, bend = (
+    n = len(places)
+    L, width, bend, gap = (
         rng.uniform(low, high, (n, 1, 1))
-        for low, high in ((0.082, 0.105), (0.021, 0.026), (0.4, 1.0))
+        for low, high in ((0.082, 0.105), (0.022, 0.027), (0.4, 1.0), (0.010, 0.0135))
     )
     up = _unit(_UP + rng.normal(0, 0.35, blades.shape) + 0.4 * _unit(places - [0, 0, 0.6]))
     across = _unit(np.cross(up, blades))[:, None]
-    d, normal = blades[:, None], np.cross(blades, across[:, 0])[:, None]
+    d, normal, stalk = blades[:, None], np.cross(blades, across[:, 0])[:, None], stalks[:, None]
 
-    phase = bend * s[:, None]
-    tangent = d * np.cos(phase) - normal * np.sin(phase)
-    upward = normal * np.cos(phase) + d * np.sin(phase)
-    w = width * _half_width(s)[:, None]
+    s, side, half = _LEAF_S[:, None], _LEAF_SIDE[:, None], np.abs(_LEAF_SIDE[:, None])
+    is_stalk, is_rib = (np.arange(len(s))[:, None] < end for end in (_STALK, _STALK + _RIB))
+    tangent = d * np.cos(bend * s) - normal * np.sin(bend * s)
+    upward = normal * np.cos(bend * s) + d * np.sin(bend * s)
+    w = width * 1.5 * math.sqrt(3) * s * (1 - s) * (2 - s)
+    slope = width * 1.5 * math.sqrt(3) * (2 - 6 * s + 3 * s * s) / L
+    # The halves of the blade rise a little from the midrib.
     fold = 0.3
-    sideways = side[:, None] * across * math.cos(fold) + np.abs(side)[:, None] * upward * fold
-    gap = rng.uniform(0.010, 0.0135, (n, 1, 1))
-    out = (np.minimum(np.arange(k), STALK - 1) + 0.7)[:, None] * gap
-    arc = L * (d * np.sin(phase) - normal * (1 - np.cos(phase))) / bend
-    means = places[:, None] + out * stalks[:, None] + arc + 0.5 * w * sideways
+    sideways = side * across + half * fold * upward
+    from_bark = (np.minimum(np.arange(len(s)), _STALK - 1) + 0.7)[:, None] * gap
+    arc = L * (d * np.sin(bend * s) - normal * (1 - np.cos(bend * s))) / bend
+    means = places[:, None] + from_bark * stalk + arc + 0.5 * w * sideways + 0.001 * is_rib * upward
 
-    # Disks follow the middle of their half of the blade, which runs at the slope w'(s) / 2 L.
-    slope = width * (_half_width(s + 1e-4) - _half_width(s - 1e-4 * (s > 0)))[:, None] / 4e-4 / L
-    along = np.where(stalk[:, None], stalks[:, None], tangent + slope * sideways)
-    flat = upward - fold * side[:, None] * across
-    flat = np.where(
-        stalk[:, None], upward - along * np.sum(upward * along, -1, keepdims=True), flat
-    )
-    thin = np.full_like(w, 0.0012)
-    length = np.where(rib[:, None], 0.11 * L, 0.125 * L)
-    scales = np.where(rib[:, None], 0.0016, np.where(side[:, None] == 0, 0.33, 0.40) * w)
-    scales = np.concatenate([np.where(stalk[:, None], 0.6 * gap, length), scales, thin], axis=-1)
-    age = rng.uniform(0, 1, (n, 1, 1))
-    green = _DARK_GREEN + (0.55 * age + 0.35 * s[:, None]) * (_LIGHT_GREEN - _DARK_GREEN)
+    # Disks follow the middle of their half of the blade; stalks are round.
+    along = np.where(is_stalk, stalk, tangent + 0.5 * slope * sideways)
+    flat = _unit(np.cross(along, np.cross(upward - fold * side * across, along)))
+    axes = _frames(flat.reshape(-1, 3), along.reshape(-1, 3))
+    length = np.where(is_stalk, 0.6 * gap, np.where(is_rib, 0.11, 0.125) * L)
+    breadth = np.where(is_rib, 0.0016, np.where(half > 0, 0.40, 0.33) * w)
+    thickness = np.where(is_stalk, 0.0016, 0.0012) + 0 * w
+    scales = np.concatenate([length, breadth, thickness], axis=-1).reshape(-1, 3)
+
+    # Each leaf has its own green, which is lighter towards the tip and on the midrib.
+    lightness = 0.55 * rng.uniform(0, 1, (n, 1, 1)) + 0.35 * s
+    green = _DARK_GREEN + lightness * (_LIGHT_GREEN - _DARK_GREEN)
     green = green * rng.uniform(0.8, 1.15, (n, 1, 1))
-    albedo = np.where(rib[:, None], 0.55 * _MIDRIB + 0.45 * green, green)
-    means = means + 0.001 * rib[:, None] * upward
-    return _Body(
-        means.reshape(-1, 3),
-        _frames(_unit(flat).reshape(-1, 3), _unit(along).reshape(-1, 3)),
-        scales.reshape(-1, 3),
-        albedo.reshape(-1, 3),
-        np.full(n * k, 0.12),
-    )
+    albedo = np.where(is_rib, 0.55 * _MIDRIB + 0.45 * green, green).reshape(-1, 3)
+    return _Body(means.reshape(-1, 3), axes, scales, albedo, np.full(len(albedo), 0.12))
 
 
 def _transmittance(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -396,7 +345,5 @@ def _lit(body: _Body) -> Gaussians:
     linear = mirror[:, [1, 2, 0]] * [1, -1, 1] / c1
     sh = np.concatenate([(color[:, None] - 0.5) / c0, linear[:, :, None] * strength], axis=1)
     quaternions = np.roll(Rotation.from_matrix(body.frames).as_quat(), 1, axis=-1)
-    opacities = np.full(len(normal), 0.95)
-    dtype = jnp.zeros(()).dtype
-    parts = (body.means, quaternions, body.scales, opacities, sh)
-    return Gaussians.from_scales(*(jnp.asarray(part, dtype=dtype) for part in parts))
+    parts = (body.means, quaternions, body.scales, np.full(len(normal), 0.95), sh)
+    return Gaussians.from_scales(*(jnp.asarray(part, dtype=float) for part in parts))
