@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -36,9 +36,9 @@ class Grid(eqx.Module):
 
     def __init__(
         self,
-        origin: Sequence[float] | Array | np.ndarray,
+        origin: Any,
         shape: Sequence[int],
-        h: float | Array | np.ndarray,
+        h: Any,
         *,
         periodic: Sequence[bool] | None = None,
     ):

@@ -1,6 +1,6 @@
 """Particles: lattices that fill simple shapes, and the rest volumes of captured points."""
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,9 +12,7 @@ from pgjax._types import require
 _NEIGHBOURS = (7, 18)
 
 
-def block(
-    lower: Sequence[float], upper: Sequence[float], spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
+def block(lower: Any, upper: Any, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """A lattice that fills a box, in two or three dimensions.
 
     Args:
@@ -40,7 +38,7 @@ def block(
     return x, np.full(len(x), np.prod(step))
 
 
-def ball(center: Sequence[float], radius: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+def ball(center: Any, radius: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """A lattice that fills a ball (a disc in two dimensions).
 
     Returns:

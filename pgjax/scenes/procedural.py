@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from pgjax.render.gaussians import Gaussians
 
 _POT_SPACING = 0.02
 _WOOD_SPACING = 0.017
-_LEAVES = 310
+_LEAVES = 300
 # One leaf: Gaussians of the stalk, of the midrib, of the left and right half, and of the tip, with
 # their place along the blade (0 … 1) and side of it.
 _STALK, _RIB = 3, 4
@@ -140,8 +140,7 @@ def _solid(
 
 def _pot(rng: np.random.Generator) -> _Body:
     """A tapered pot with a rim, two rings thick, filled with soil to below the rim."""
-    layers = 15
-    z = np.linspace(0.005, 0.277, layers)
+    layers, z = 15, np.linspace(0.005, 0.277, 15)
     radii = np.where(z > 0.22, 0.168, 0.118 + 0.035 * z / 0.22)
     radii[[0, -1]] -= 0.008  # rounded edges
     axis = _Branch(z[:, None] * _UP, np.tile(_UP, (layers, 1)), radii)
@@ -186,9 +185,10 @@ def _direction(azimuth: float, degrees: float) -> np.ndarray:
 def _tree(rng: np.random.Generator) -> list[_Branch]:
     """The trunk first, rooted in the soil; then its boughs, and two branches from each of them."""
     lean = rng.uniform(0, 2 * math.pi)
-    ends = (_direction(lean, 60), _direction(lean + math.pi, 72))
-    root = np.array([0, 0, 0.14]) - 0.02 * _direction(lean, 0)
-    trunk = _grow(root, ends, 0.40, (0.038, 0.030))
+    ends = (_direction(lean, 60.0), _direction(lean + math.pi, 72.0))
+    root = np.array([0, 0, 0.14]) - 0.02 * _direction(lean, 0.0)
+    trunk = _grow(root, ends, 0.46, (0.040, 0.031))
+    trunk.radii[0] *= 0.55
     # A flare where the trunk leaves the soil.
     trunk.radii[:] += 0.006 * np.exp(-(((trunk.points[:, 2] - 0.24) / 0.04) ** 2))
     branches = [trunk]
@@ -196,14 +196,14 @@ def _tree(rng: np.random.Generator) -> list[_Branch]:
         azimuth = lean + i * _GOLDEN_ANGLE + rng.uniform(-0.2, 0.2)
         elevation = 16 + 62 * rise
         ends = (_direction(azimuth, elevation), _direction(azimuth, 38 + 40 * rise))
-        length = rng.uniform(0.17, 0.20) + 0.04 * rise
+        length = rng.uniform(0.18, 0.21) + 0.06 * rise
         bough = _grow(trunk.at(0.86 + 0.14 * rise), ends, length, (0.025, 0.0215))
         branches.append(bough)
         for side, place in ((-1, 0.5), (1, 0.72)):
             turn = side * rng.uniform(0.75, 1.05) / math.cos(math.radians(0.6 * elevation))
             first = _direction(azimuth + turn, elevation - 5)
             last = _direction(azimuth + turn - 0.4 * side, elevation + 15)
-            length = rng.uniform(0.11, 0.14)
+            length = rng.uniform(0.12, 0.15)
             branches.append(_grow(bough.at(place), (first, last), length, (0.0215, 0.0205)))
     return branches
 
@@ -212,7 +212,7 @@ def _depth_inside(points: np.ndarray, branches: Sequence[_Branch]) -> np.ndarray
     """How deep points lie inside the wood (negative outside), from the nearest place of it."""
     depth = np.full(len(points), -np.inf)
     for branch in branches:
-        distance, place = cKDTree(branch.points).query(points)
+        distance, place = KDTree(branch.points).query(points)
         depth = np.maximum(depth, branch.radii[place] - distance)
     return depth
 
@@ -224,7 +224,7 @@ def _wood(branches: Sequence[_Branch], rng: np.random.Generator) -> _Body:
         means, ring, place = _sweep(branch, _WOOD_SPACING)
         kept = _depth_inside(means, branches[:i]) < 0.2 * _WOOD_SPACING
         if len(earlier):
-            kept &= cKDTree(earlier).query(means)[0] > 0.55 * _WOOD_SPACING
+            kept &= KDTree(earlier).query(means)[0] > 0.55 * _WOOD_SPACING
         normals = means - branch.points[place] + 1e-6 * branch.tangents[place]
         tip = place == len(branch.points) - 1
         normals = _unit(_unit(normals) + np.where(tip[:, None], branch.tangents[place], 0))
@@ -256,7 +256,7 @@ def _buds(
     e1 = _unit(np.cross(tangents[place], [0.9, 0.4, 0.0]))
     normals = np.cos(angle) * e1 + np.sin(angle) * np.cross(tangents[place], e1)
     places = points[place] + radii[place, None] * normals
-    outward = _unit(places - [0, 0, 0.55])
+    outward = _unit(places - [0, 0, 0.6])
     # At the tip of a branch stalks go on along it.
     sideways = np.where(from_tip[:, None] > 0, 1, 0.5) * normals
     stalks = _unit(sideways + 0.5 * tangents[place] + 0.5 * outward + 0.15 * _UP)
@@ -276,9 +276,9 @@ def _leaves(
     n = len(places)
     L, width, bend, gap = (
         rng.uniform(low, high, (n, 1, 1))
-        for low, high in ((0.082, 0.105), (0.022, 0.027), (0.4, 1.0), (0.010, 0.0135))
+        for low, high in ((0.09, 0.115), (0.024, 0.029), (0.4, 1.0), (0.010, 0.0135))
     )
-    up = _unit(_UP + rng.normal(0, 0.35, blades.shape) + 0.4 * _unit(places - [0, 0, 0.6]))
+    up = _unit(_UP + rng.normal(0, 0.35, blades.shape) + 0.4 * _unit(places - [0, 0, 0.65]))
     across = _unit(np.cross(up, blades))[:, None]
     d, normal, stalk = blades[:, None], np.cross(blades, across[:, 0])[:, None], stalks[:, None]
 
@@ -318,7 +318,7 @@ def _transmittance(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
     `T = exp(−Σ ρ a Δt / 2)`, with ρ the Gaussians per volume in a ball, a the area of one of them,
     and Δt the diameter of the ball.
     """
-    tree, area, depth = cKDTree(points), 1.5e-4, np.zeros(len(points))
+    tree, area, depth = KDTree(points), 1.5e-4, np.zeros(len(points))
     for distance, radius in ((0.07, 0.03), (0.15, 0.05), (0.27, 0.07)):
         count = tree.query_ball_point(points + distance * direction, radius, return_length=True)
         depth += count / (4 / 3 * math.pi * radius**3) * area * 2 * radius / 2
@@ -336,7 +336,7 @@ def _lit(body: _Body) -> Gaussians:
     sun = np.maximum(facing + 0.25, 0) / 1.25 + 0.3 * np.maximum(-facing, 0) * (body.gloss > 0.1)
     sky = (0.75 + 0.25 * normal[:, 2]) * _transmittance(body.means, _UP)
     sunlight = 0.85 * sun * _transmittance(body.means, _LIGHT)
-    light = 0.25 + 0.55 * sky[:, None] + sunlight[:, None] * np.array([1.0, 0.97, 0.88])
+    light = 0.3 + 0.5 * sky[:, None] + sunlight[:, None] * np.array([1.0, 0.97, 0.88])
     color = np.clip(body.albedo * light, 0.02, 1.0)
     mirror = 2 * facing[:, None] * normal - _LIGHT
     strength = (body.gloss * (0.2 + sunlight))[:, None, None] * np.ones(3)

@@ -1,8 +1,7 @@
 """Scenes and rollouts that the verification cases share."""
 
-import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -13,7 +12,8 @@ from pgjax.scene import Scene
 from pgjax.splines import BSpline
 from pgjax.state import State
 from pgjax.step import step
-from pgjax.transfer import MLS, SplineGradient
+from pgjax.transfer import MLS, AbstractScheme, SplineGradient
+from pgjax.transfer.scheme import Flux
 
 # The four combinations of spline and gradient, with β of the stable time step.
 SCHEMES = {
@@ -43,7 +43,7 @@ def without_affine(state: State) -> State:
     return eqx.tree_at(lambda s: s.C, state, jnp.zeros_like(state.C))
 
 
-@functools.partial(eqx.filter_jit)
+@eqx.filter_jit
 def roll(
     scene: Scene,
     state: State,
@@ -97,3 +97,27 @@ def kinetic_energy(scene: Scene, state: State) -> jax.Array:
     v, C = (a.astype(scene.volumes.dtype) for a in (state.v, state.C))
     density = jnp.sum(v**2, axis=1) + scene.D * jnp.sum(C**2, axis=(1, 2))
     return 0.5 * jnp.sum(scene.masses * density)
+
+
+@final
+class MissingTimeStep(AbstractScheme):
+    """A negative control: the supplement's misprint `F ← (I + ∇v) F`, without Δt.
+
+    Args:
+        dt: the time step by which the step multiplies.
+    """
+
+    dt: jax.Array = eqx.field(converter=jnp.asarray)
+
+    def velocity_gradient(self, C: Flux, slope: Flux) -> Flux:
+        """`∇v/Δt`."""
+        del C
+        return slope / self.dt
+
+    def split(self, flux: Flux, D: jax.Array) -> tuple[Flux | None, Flux | None]:
+        """As `SplineGradient`."""
+        return SplineGradient().split(flux, D)
+
+    def roughness(self, spline: BSpline) -> float:
+        """As `SplineGradient`."""
+        return spline.roughness

@@ -1,0 +1,241 @@
+"""What every constitutive law must obey, whatever it is; new ones are added in `laws.py`."""
+
+import functools
+import inspect
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import laws
+import numpy as np
+import pytest
+from laws import ELASTIC, I3, LAWS, PLASTIC, dev, norm, respond, strains, volume
+
+import pgjax.models as pm
+import pgjax.models.reference as svd
+
+every_law = pytest.mark.parametrize("name", LAWS)
+every_plastic_law = pytest.mark.parametrize("name", PLASTIC)
+double = pytest.mark.float64
+
+# In float32 (PGJAX_TEST_FLOAT32=1) every tolerance scales with the precision.
+ROUNDING = float(jnp.finfo(jnp.zeros(()).dtype).eps)
+
+
+def concrete_subclasses(base):
+    for cls in base.__subclasses__():
+        yield from concrete_subclasses(cls)
+        if not inspect.isabstract(cls) and cls.__module__.startswith("pgjax."):
+            yield cls
+
+
+@pytest.mark.parametrize("base", [pm.AbstractElasticity, pm.AbstractPlasticity])
+def test_every_law_of_the_package_is_tested(base):
+    tested = {type(part) for law in LAWS.values() for part in vars(law.material).values()}
+    assert set(concrete_subclasses(base)) <= tested
+
+
+def answer(name, F, history=None):
+    """New F, history and stress of a law, for trial deformation gradients; numpy arrays."""
+    law = LAWS[name]
+    H, history, tau = respond(law.material, jnp.asarray(F - I3), history)
+    return np.asarray(H) + I3, history, np.asarray(tau)
+
+
+# --- Symmetries ----------------------------------------------------------------------------------
+
+
+@every_law
+def test_response_is_objective_isotropic_and_symmetric(name):
+    """Z(Q F P) = Q Z(F) P and τ(Q F P) = Q τ(F) Qᵀ = its transpose, for rotations Q and P."""
+    law, rng = LAWS[name], np.random.default_rng(1)
+    F = laws.deformations()
+    Q, P = (laws.rotations(rng, len(F)) for _ in range(2))
+    history = None if law.history is None else jnp.full(len(F), law.history)
+    if name == "DruckerPrager" or name == "DruckerPragerSVD":
+        F = F[4:]  # states of rest lie on the tip, where rounding decides
+        Q, P = Q[4:], P[4:]
+    Fe, _, tau = answer(name, F, history)
+    turned, _, tau_turned = answer(name, Q @ F @ P, history)
+    QT = Q.swapaxes(1, 2)
+    scale = norm(tau).max()
+    assert norm(tau - tau.swapaxes(1, 2)).max() <= 20 * ROUNDING * scale
+    assert norm(turned - Q @ Fe @ P).max() <= 1000 * ROUNDING
+    assert norm(tau_turned - Q @ tau @ QT).max() <= 1000 * ROUNDING * scale
+
+
+@every_law
+def test_a_rotation_makes_no_stress(name):
+    R = laws.rotations(np.random.default_rng(2), 48)
+    Fe, _, tau = answer(name, R, laws.start(LAWS[name], 48))
+    assert norm(tau).max() <= 100 * ROUNDING * laws.E
+    assert norm(Fe - R).max() <= 100 * ROUNDING
+
+
+# --- Plastic flow --------------------------------------------------------------------------------
+
+
+@every_plastic_law
+def test_return_map_ends_on_the_yield_surface_and_stays(name):
+    """Rate-independent: f ≤ 0 after it. A second mapping changes nothing."""
+    law, F = LAWS[name], laws.deformations()
+    elasticity = law.material.elasticity
+    Fe, history, tau = answer(name, F, laws.start(law, len(F)))
+    moved = norm(Fe - F) > 1e-6
+    assert moved.sum() > 20
+    if not law.rate_independent:
+        return
+    excess = laws.overshoot(law.material.plasticity, elasticity, tau, history)
+    assert excess.max() <= 1000 * ROUNDING * laws.E
+    if law.corrected:
+        return  # what it remembers acts again
+    again, _, _ = answer(name, Fe, history)
+    assert norm(again - Fe).max() <= 1000 * ROUNDING
+
+
+@every_plastic_law
+def test_plastic_flow_dissipates_and_keeps_the_volume_if_claimed(name):
+    law = LAWS[name]
+    H = strains()
+    after, history, _ = respond(law.material, H, laws.start(law, len(H)))
+    if not law.corrected:
+        before, _ = laws.energies(law.material.elasticity, H)
+        stored, _ = laws.energies(law.material.elasticity, after)
+        released = np.asarray(before - stored)
+        assert released.min() >= -100 * ROUNDING * laws.E
+        assert released.max() > 0.01
+    if law.isochoric:
+        assert abs(volume(after) / volume(H) - 1).max() <= 100 * ROUNDING
+
+
+def test_volume_correction_remembers_what_the_tip_gave_away():
+    """log J + v is kept."""
+    H = strains()
+    for name in ("DruckerPrager-corrected", "DruckerPragerSVD-corrected"):
+        after, v, _ = respond(LAWS[name].material, H, jnp.full(len(H), 0.02))
+        change = np.log(volume(after)) + v - np.log(volume(H)) - 0.02
+        assert abs(change).max() <= 1000 * ROUNDING
+        assert abs(v - 0.02).max() > 0.1
+
+
+# --- Derivatives ---------------------------------------------------------------------------------
+
+
+def directions(law, H, history):
+    """Two random directions of H, one for the history, one per parameter of the material."""
+    rng = np.random.default_rng(3)
+    zero = jax.tree.map(jnp.zeros_like, (law.material, H, history))
+    random = [jnp.asarray(rng.normal(size=H.shape)) for _ in range(2)]
+    chosen = [eqx.tree_at(lambda t: t[1], zero, dH) for dH in random]
+    if history is not None:
+        chosen.append(eqx.tree_at(lambda t: t[2], zero, jnp.ones_like(history)))
+    leaves = jax.tree.leaves(law.material)
+    for i, leaf in enumerate(leaves):
+        chosen.append(eqx.tree_at(lambda t, i=i: jax.tree.leaves(t[0])[i], zero, leaf))
+    return chosen
+
+
+def along(arguments, direction, s):
+    return jax.tree.map(lambda a, da: a + s * da, arguments, direction)
+
+
+def regime(before, after):
+    """Which branch each particle took: unchanged, flowing, or without stress."""
+    return np.all(np.asarray(before == after[0]), (1, 2)) + 2 * (norm(after[2]) < 1e-11 * laws.E)
+
+
+def central_difference(arguments, direction, step=1e-4):
+    """Fourth-order difference, and which particles stayed in one regime."""
+    points = [along(arguments, direction, s * step) for s in (1, -1, 2, -2)]
+    values = [respond(*point) for point in points]
+    regimes = [regime(p[1], v) for p, v in zip(points, values, strict=True)]
+    a, b, c, d = (jax.tree.leaves(v) for v in values)
+    difference = [
+        (8 * (x - y) - (z - w)) / (12 * step) for x, y, z, w in zip(a, b, c, d, strict=True)
+    ]
+    return difference, np.all(np.array(regimes) == regimes[0], axis=0)
+
+
+def one_sided_difference(arguments, direction, step):
+    """Second-order difference towards one side."""
+    at, near, far = (respond(*along(arguments, direction, s * step)) for s in (0, 1, 2))
+    return [
+        (4 * b - 3 * a - c) / (2 * step)
+        for a, b, c in zip(*map(jax.tree.leaves, (at, near, far)), strict=True)
+    ]
+
+
+@functools.cache
+def sampled(name):
+    """Arguments that cover rest, rotation, equal stretches and flow."""
+    law, H = LAWS[name], strains()
+    return law.material, H, None if law.history is None else jnp.full(len(H), law.history)
+
+
+def derivatives(arguments, chosen):
+    """Forward derivatives per direction; largest mismatch of forward and reverse, relative."""
+    rng = np.random.default_rng(4)
+    stacked = jax.tree.map(lambda *a: jnp.stack(a), *chosen)
+    shapes = eqx.filter_eval_shape(respond, *arguments)
+    cotangent = jax.tree.map(lambda s: jnp.asarray(rng.normal(size=s.shape)), shapes)
+    forward, reverse = laws.linear_response(*arguments, stacked, cotangent)
+    dot = lambda x, y: sum(jnp.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (x, y))))  # noqa: B905, E731
+    mismatch = [
+        abs(dot(cotangent, jax.tree.map(lambda a, k=k: a[k], forward)) - dot(reverse, direction))
+        for k, direction in enumerate(chosen)
+    ]
+    size = max(float(jnp.sum(jnp.abs(a))) for a in jax.tree.leaves(forward))
+    return jax.tree.leaves(forward), max(float(m) for m in mismatch) / size
+
+
+@double
+@every_law
+def test_derivative_is_that_of_finite_differences(name):
+    """Along H, the history and every parameter: forward = reverse = differences."""
+    arguments = sampled(name)
+    chosen = directions(LAWS[name], *arguments[1:])
+    forward, mismatch = derivatives(arguments, chosen)
+    assert mismatch < 1e-14
+    for k, direction in enumerate(chosen):
+        expected, smooth = central_difference(arguments, direction)
+        assert smooth.sum() >= 30
+        for ours, theirs in zip(forward, expected, strict=True):
+            assert bool(jnp.isfinite(ours).all())
+            error = np.abs(np.asarray(ours[k] - theirs))[smooth]
+            assert error.max() <= 1e-8 * laws.E
+
+
+def states_at_yield(name, n=48):
+    """Between an elastic state and a flowing one, by bisection: elastic, flowing, 1e-15 apart."""
+    law, rng = LAWS[name], np.random.default_rng(5)
+    shear = dev(rng.normal(size=(n, 3, 3)))
+    shear = 0.4 * (shear + shear.swapaxes(1, 2)) / norm(shear)[:, None, None]
+    elastic, flowing = jnp.asarray(-0.05 * np.tile(I3, (n, 1, 1))), jnp.asarray(shear - 0.05 * I3)
+    history = None if law.history is None else jnp.zeros(n)
+    for _ in range(60):
+        middle = (elastic + flowing) / 2
+        after, _, _ = respond(law.material, middle, history)
+        same = jnp.all(after == middle, axis=(1, 2))[:, None, None]
+        elastic, flowing = jnp.where(same, middle, elastic), jnp.where(same, flowing, middle)
+    return law.material, elastic, flowing, history
+
+
+@double
+@every_plastic_law
+def test_derivative_at_yield_is_one_of_the_two(name):
+    material, elastic, flowing, history = states_at_yield(name)
+    assert float(jnp.abs(flowing - elastic).max()) < 1e-14
+    inwards = jnp.tile(-jnp.eye(3), (len(elastic), 1, 1)) - elastic  # away from yield, and back
+    for H in (elastic, flowing):
+        arguments = (material, H, history)
+        chosen = directions(LAWS[name], H, history)
+        chosen[0] = eqx.tree_at(lambda t: t[1], chosen[0], inwards + 0.05 * jnp.eye(3))
+        forward, mismatch = derivatives(arguments, chosen)
+        assert mismatch < 1e-14
+        sides = [one_sided_difference(arguments, chosen[0], s) for s in (1e-5, -1e-5)]
+        error = [
+            max(np.abs(np.asarray(a[0] - b)).max() for a, b in zip(forward, side, strict=True))
+            for side in sides
+        ]
+        assert min(error) <= 1e-7 * laws.E
+        assert max(error) > 1e-3
