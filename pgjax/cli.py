@@ -56,13 +56,14 @@ def _run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from pgjax.scenes import plan, read_scene, resolve, run, summary
-    from pgjax.scenes.run import prepare
+    from pgjax.scenes.run import require_empty
 
     if options.frames is not None and options.frames < 1:
         raise ValueError(f"Argument `--frames` must be at least 1, but is {options.frames}.")
+    if options.out is not None:
+        require_empty(options.out)
     planned = plan(read_scene(resolve(options.scene)), ply=options.ply, frames=options.frames)
     folder = options.out or _next_folder(planned.name)
-    prepare(folder, options.save_ply)
     print(summary(planned))
     with tqdm(total=planned.frames, unit="frame", file=sys.stderr) as bar:
         video = run(

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +20,9 @@ ELASTIC_FRACTION, ADVECTIVE_FRACTION, DEFORMATION_FRACTION = 0.5, 0.25, 0.2
 class Limits(NamedTuple):
     """Sharp limits of the time step for each particle, s, `(p,)`."""
 
-    elastic: Float[Array, " p"]
-    advective: Float[Array, " p"]
-    deformation: Float[Array, " p"]
+    elastic: Float[Array, "*p"]
+    advective: Float[Array, "*p"]
+    deformation: Float[Array, "*p"]
 
 
 def limits(scene: Scene, state: State) -> Limits:
@@ -45,6 +46,11 @@ def limits(scene: Scene, state: State) -> Limits:
     spin = jnp.sqrt(jnp.sum(state.C**2, axis=(1, 2)))
     speed = jnp.sqrt(jnp.sum(state.v**2, axis=1)) + 1.5 * d**0.5 * h * spin
     return Limits(elastic, h / speed, 1 / spin)
+
+
+@eqx.filter_jit
+def _smallest_limits(scene: Scene, state: State) -> Limits:
+    return jax.tree.map(jnp.min, limits(scene, state))
 
 
 def above_bound(scene: Scene, state: State, dt: Scalar) -> Bool[Array, " p"]:
@@ -86,7 +92,7 @@ def stable_dt(
         )
     dt = fraction * float(rest)
     if state is not None:
-        now = jax.tree.map(lambda a: float(jnp.min(a)), limits(scene, state))
+        now = jax.tree.map(float, _smallest_limits(scene, state))
         dt = min(
             dt,
             fraction * now.elastic,

@@ -22,7 +22,7 @@ jax.config.update("jax_enable_x64", not FLOAT32)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-install_import_hook("pgjax", "beartype.beartype")
+install_import_hook("pgjax", "typecheck.check")
 
 
 def pytest_configure(config):

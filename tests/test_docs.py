@@ -16,7 +16,7 @@ def run_blocks(path):
     blocks = re.findall(r"```python\n(.*?)```", path.read_text(), flags=re.DOTALL)
     assert blocks
     for block in blocks:
-        exec(compile(block, str(path), "exec"), names)  # noqa: S102
+        exec(compile(block, str(path), "exec"), names)
     return names
 
 

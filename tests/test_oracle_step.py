@@ -80,7 +80,7 @@ CASES = {
 }
 
 
-def run_both(name, d, degree, scheme, **kwargs):
+def run_both(name, d, degree, scheme):
     material, stress, return_map, history = CASES[name]
     rng = np.random.default_rng(3)
     n, h = 9, 0.1

@@ -40,7 +40,9 @@ class Table:
     def _take(self, key: str, default: Any) -> Any:
         self._known.append(key)
         if key not in self._data and default is _REQUIRED:
-            raise SceneError(f"{self._name}: `{key}` is missing.")
+            misspelt = difflib.get_close_matches(key, self._data, n=1)
+            hint = f" (is `{misspelt[0]}` meant?)" if misspelt else ""
+            raise SceneError(f"{self._name}: `{key}` is missing{hint}.")
         return self._data.get(key, default)
 
     def number(

@@ -51,7 +51,8 @@ def run(
         SimulationError: a particle was masked. The frames up to then are written.
         ValueError: the folder is not empty.
     """
-    prepare(folder, ply_frames)
+    require_empty(folder)
+    (folder / "ply" if ply_frames else folder).mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     video = folder / "video.mp4"
     state, ahead = plan.state, _advance(plan, plan.state)
@@ -83,14 +84,13 @@ def run(
     return video
 
 
-def prepare(folder: Path, ply_frames: bool) -> None:
-    """Make the output folder; an existing one must be empty."""
+def require_empty(folder: Path) -> None:
+    """Raise a `ValueError` if the folder holds anything."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(
             f"Argument `out` must be a new or an empty folder, so that nothing is overwritten, "
             f"but {folder} is not."
         )
-    (folder / "ply" if ply_frames else folder).mkdir(parents=True, exist_ok=True)
 
 
 def _advance(plan: Plan, state: State) -> Trajectory:

@@ -65,6 +65,21 @@ def roll(
     return jax.lax.scan(frame, state, None, length=steps // every)
 
 
+def elastic_strain(state: State) -> Any:
+    """`Fe − I`, for `observe`."""
+    return state.He
+
+
+def wide(a: Any) -> np.ndarray:
+    """On the host in double precision, so that the comparison adds no rounding."""
+    return np.asarray(a, np.float64)
+
+
+def largest(error: Any) -> float:
+    """The maximum norm."""
+    return float(np.max(np.abs(wide(error))))
+
+
 def positions(state: State) -> Any:
     """Positions, for `observe`."""
     return state.x

@@ -1,6 +1,5 @@
 """Level 0: the transfers between particles and grid (V01–V05)."""
 
-
 import itertools
 
 import equinox as eqx
