@@ -31,7 +31,7 @@ BLOCKS = {
     "sand": {"friction_angle": 30.0},
     "cohesive sand": {"friction_angle": 30.0, "cohesion": 0.01},
     "paste": {"yield_stress": 1000.0, "viscosity": 50.0},
-    "shear-thinning paste": {"yield_stress": 1000.0, "viscosity": 50.0, "h": 0.7},
+    "shear-thinning paste": {"yield_stress": 1000.0, "viscosity": 500.0, "h": 0.7},
 }
 COUNT, PER_BLOCK = len(BLOCKS), SIDE**2
 ELASTIC = {"E": 1e5, "nu": 0.3, "density": 1000.0}
@@ -74,7 +74,8 @@ def _layout() -> tuple[np.ndarray, np.ndarray]:
     local = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     corners = H * np.stack([3 + APART * np.arange(COUNT), np.full(COUNT, FLOOR)], axis=-1)
     x = corners[:, None] + local + 1e-3 * rng.standard_normal((COUNT, PER_BLOCK, 2))
-    return x, (1 + rng.standard_normal(x.shape)) / PER_BLOCK
+    spread = 2 * local / axis[-1] - 1
+    return x, (0.5 + spread + rng.standard_normal(x.shape)) / PER_BLOCK
 
 
 POSITIONS, WEIGHTS = _layout()

@@ -38,35 +38,53 @@ def itself(state: State) -> State:
     return state
 
 
+def nothing(scene: Scene, state: State) -> None:
+    """Observe nothing."""
+    del scene, state
+
+
 def without_affine(state: State) -> State:
     """PIC: forget C after every step."""
     return eqx.tree_at(lambda s: s.C, state, jnp.zeros_like(state.C))
 
 
-@eqx.filter_jit
 def roll(
     scene: Scene,
     state: State,
     dt: Any,
     steps: int,
-    observe: Callable[[State], Any] = lambda state: None,
+    observe: Callable[[Scene, State], Any] = nothing,
     after: Callable[[State], State] = itself,
     every: int = 1,
 ) -> tuple[State, Any]:
     """`steps` steps; what `observe` saw after each `every` of them, stacked."""
+    # An array, so that a new time step compiles nothing.
+    return _roll(scene, state, jnp.asarray(dt, state.dtype), steps, observe, after, every)
 
+
+@eqx.filter_jit
+def _roll(
+    scene: Scene,
+    state: State,
+    dt: jax.Array,
+    steps: int,
+    observe: Callable[[Scene, State], Any],
+    after: Callable[[State], State],
+    every: int,
+) -> tuple[State, Any]:
     def advance(state: State, _: Any) -> tuple[State, None]:
         return after(step(scene, state, dt)), None
 
     def frame(state: State, _: Any) -> tuple[State, Any]:
         state, _ = jax.lax.scan(advance, state, None, length=every)
-        return state, observe(state)
+        return state, observe(scene, state)
 
     return jax.lax.scan(frame, state, None, length=steps // every)
 
 
-def elastic_strain(state: State) -> Any:
+def elastic_strain(scene: Scene, state: State) -> Any:
     """`Fe − I`, for `observe`."""
+    del scene
     return state.He
 
 
@@ -80,8 +98,9 @@ def largest(error: Any) -> float:
     return float(np.max(np.abs(wide(error))))
 
 
-def positions(state: State) -> Any:
+def positions(scene: Scene, state: State) -> Any:
     """Positions, for `observe`."""
+    del scene
     return state.x
 
 
