@@ -1,6 +1,7 @@
 """One time step of the Material Point Method, written as the algorithm reads."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,15 +37,21 @@ def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
 
     held, state = _impose(scene, state, t, dt)
     state, at, tau = _stress(scene, state)
-    grid_mass, grid_v = _particles_to_grid(scene, state, at, tau, t, dt)
+    grid_mass, grid_v = _particles_to_grid(scene, state, at, tau, dt)
     grid_v = _forces_and_boundaries(scene, grid_mass, grid_v, t, dt)
     v, C, L = _grid_to_particles(scene, at, grid_v)
     return _update(scene, state, held, v, C, L, dt)
 
 
 def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Array, " p"], State]:
-    """Prescribed velocities and pushes; which particles are held to theirs in this step."""
+    """Body forces, prescribed velocities and pushes; which particles are held in this step.
+
+    They act before anything is checked, so that a NaN from a user's function is found.
+    """
     v, held = state.v, jnp.zeros_like(state.alive)
+    if scene.body_force is not None:
+        acceleration = jax.vmap(scene.body_force, in_axes=(0, None))(scene.X0, t)
+        v = v + dt * acceleration.astype(state.dtype)
     mass = jnp.where(state.alive, scene.masses, 0)
     for condition in scene.particle_conditions:
         v = condition.velocity(v, mass, t, dt)
@@ -96,13 +103,11 @@ def _stress(scene: Scene, state: State) -> tuple[State, Stencil, Float[Array, "p
 
 def _without_nan(state: State, finite: Bool[Array, " p"]) -> State:
     """Rest values for what is not finite; only the position stays as it is, to be seen."""
-    C, He, H = (None if a is None else _where(finite, a, 0) for a in (state.C, state.He, state.H))
-    return eqx.tree_at(
-        lambda s: (s.v, s.C, s.He, s.H),
-        state,
-        (_where(finite, state.v, 0), C, He, H),
-        is_leaf=lambda leaf: leaf is None,
-    )
+
+    def fields(s: State) -> tuple[Any, ...]:
+        return tuple(a for a in (s.v, s.C, s.He, s.H) if a is not None)
+
+    return eqx.tree_at(fields, state, tuple(_where(finite, a, 0) for a in fields(state)))
 
 
 def _particles_to_grid(
@@ -110,19 +115,15 @@ def _particles_to_grid(
     state: State,
     at: Stencil,
     tau: Float[Array, "p 3 3"],
-    t: Scalar,
     dt: Scalar,
 ) -> tuple[Float[Array, "*grid 1"], Float[Array, "*grid d"]]:
-    """Mass and velocity of the nodes, internal and body forces already in the momentum.
+    """Mass and velocity of the nodes, the internal forces already in the momentum.
 
     `m_i = Σ w m_p`, `m_i v_i = Σ w m_p (v_p + C_p (x_i − x_p)) − Δt Σ V⁰ τ ∇w` (eqs. 1–2).
     """
-    d, dtype = scene.grid.dimension, state.dtype
+    d = scene.grid.dimension
     mass = jnp.where(state.alive, scene.masses, 0)[:, None]
     v, C = _where(state.alive, state.v, 0), _where(state.alive, state.C, 0)
-    if scene.body_force is not None:
-        force = jax.vmap(scene.body_force, in_axes=(0, None))(scene.X0, t)
-        v = v + dt * force.astype(dtype)
     flux = -dt * scene.volumes[:, None, None] * tau[:, :d, :d]
     to_B, to_S = scene.scheme.split(flux, scene.D)
     B = mass[:, :, None] * C

@@ -13,6 +13,7 @@ import numpy as np
 import pgjax.models as pm
 import pgjax.models.reference as svd
 from pgjax.models.elasticity import volume_change
+from pgjax.models.material import cast
 
 E, NU, DT = 7.0, 0.3, 0.01
 I3 = np.eye(3)
@@ -22,8 +23,8 @@ I3 = np.eye(3)
 class Law:
     """A material and what it claims of itself.
 
-    `history` is a value that has an effect (None: no memory), `fast` the name of the law of which
-    this one is the form with the decomposition.
+    `history` is a value that has an effect (None: no memory), `kink` whether the derivative jumps
+    where flow begins, `fast` the name of the law of which this is the form with an SVD.
     """
 
     material: pm.Material
@@ -31,6 +32,7 @@ class Law:
     rate_independent: bool = True
     isochoric: bool = False
     corrected: bool = False
+    kink: bool = True
     fast: str | None = None
 
     @property
@@ -55,7 +57,9 @@ def _laws() -> dict[str, Law]:
         "DruckerPrager-cohesive": Law(material(hencky, pm.DruckerPrager(30.0, 0.02))),
         "DruckerPrager-corrected": Law(material(hencky, pm.DruckerPrager(30.0, 0.02, True)), **wet),
         "HerschelBulkley": Law(material(devvol, pm.HerschelBulkley(0.7, 0.1)), **paste),
-        "HerschelBulkley-h": Law(material(devvol, pm.HerschelBulkley(0.7, 0.1, 0.6)), **paste),
+        "HerschelBulkley-h": Law(
+            material(devvol, pm.HerschelBulkley(0.7, 0.1, 0.6)), **paste, kink=False
+        ),
         "HerschelBulkley-plastic": Law(
             material(devvol, pm.HerschelBulkley(0.7, 0.0)), isochoric=True
         ),
@@ -156,7 +160,8 @@ def _history(value, n):
 def run(name, F, history=None, dtype=None):
     """New F, history and stress of a law for trial deformation gradients `(n, 3, 3)`, in numpy."""
     law = LAWS[name]
-    H, history, tau = respond(law.material, jnp.asarray(F - I3, dtype), history)
+    dtype = jnp.zeros(()).dtype if dtype is None else dtype
+    H, history, tau = respond(cast(law.material, dtype), jnp.asarray(F - I3, dtype), history)
     return np.asarray(H) + I3, history, np.asarray(tau)
 
 
@@ -203,3 +208,14 @@ def linear_response(material, H, history, directions, cotangent):
     _, forward = jax.linearize(respond_to, arrays)
     (reverse,) = jax.linear_transpose(forward, arrays)(cotangent)
     return jax.vmap(forward)(directions), reverse
+
+
+def all_finite(*arguments):
+    """Whether response and derivatives are finite; `arguments` as of `respond`."""
+    response = respond(*arguments)
+    ones = jax.tree.map(jnp.ones_like, response)
+    # As many directions as in `test_models`, so that nothing is compiled again.
+    count = 1 + len(jax.tree.leaves(arguments))
+    directions = jax.tree.map(lambda a: jnp.ones((count, *a.shape)), arguments)
+    answers = response, linear_response(*arguments, directions, ones)
+    return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(answers))

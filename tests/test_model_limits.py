@@ -16,10 +16,18 @@ from laws import I3, LAWS, dev, norm, respond, run
 import pgjax.models as pm
 import pgjax.models.reference as svd
 from pgjax.models.elasticity import principal_stretches
-from pgjax.models.material import particle_axes
+from pgjax.models.material import cast, particle_axes
 
 double = pytest.mark.float64
+ROUNDING = float(jnp.finfo(jnp.zeros(()).dtype).eps)
 MU, LAM, KAPPA = oracle.lame(laws.E, laws.NU)
+
+EXACT = {
+    "FixedCorotated": lambda F: oracle.fixed_corotated(F, mu=MU, lam=LAM),
+    "StVKHencky": lambda F: oracle.hencky(F, mu=MU, lam=LAM),
+    "NeoHookean": lambda F: oracle.neo_hookean(F, mu=MU, lam=LAM),
+    "DevVolNeoHookean": lambda F: oracle.dev_vol_neo_hookean(F, mu=MU, kappa=KAPPA),
+}
 
 # --- H01-H03, H07-H09: any F at all --------------------------------------------------------------
 
@@ -50,10 +58,161 @@ def hard_states(seed=7):
 def test_any_state_has_a_finite_response_and_derivative(name):
     """Inverted, singular, of rank 1 or 0, stretched and crushed a thousandfold."""
     law, H = LAWS[name], jnp.asarray(hard_states() - I3)
-    arguments = law.material, H, laws.later(law, len(H))
-    response = respond(*arguments)
-    ones = jax.tree.map(jnp.ones_like, response)
-    count = 2 + len(jax.tree.leaves(arguments)) - 1  # as many as in `test_models`: one compilation
-    directions = jax.tree.map(lambda a: jnp.ones((count, *a.shape)), arguments)
-    for leaf in jax.tree.leaves((response, laws.linear_response(*arguments, directions, ones))):
-        assert bool(jnp.isfinite(leaf).all())
+    assert laws.all_finite(law.material, H, laws.later(law, len(H)))
+
+
+@pytest.mark.parametrize("name", [*EXACT, "VonMises", "HerschelBulkley-plastic"])
+def test_any_state_has_a_finite_response_in_float32(name):
+    Fe, _, tau = run(name, hard_states(), dtype=jnp.float32)
+    assert np.isfinite(Fe).all()
+    assert np.isfinite(tau).all()
+
+
+@pytest.mark.parametrize("name", ["FixedCorotated", "NeoHookean"])
+def test_stress_of_a_thousandfold_stretch_is_the_closed_form(name):
+    """H07. Turned out of the axes, J loses what the condition number of F costs float32."""
+    F = hard_states()
+    exact = np.array([EXACT[name](f) for f in F[6::12]])
+    for dtype, tolerance in ((None, 1e2 * ROUNDING), (jnp.float32, 1e-3)):
+        _, _, tau = run(name, F, dtype=dtype)
+        error = norm(tau[6::12] - exact) / norm(exact)
+        assert error[0] < 1e-5
+        assert error.max() < max(1e-6, tolerance)
+
+
+def test_crushed_and_inverted_states_are_pushed_back():
+    """H01 and H08: the stress acts against the direction that was crushed."""
+    for name in ("NeoHookean", "StVKHencky", "StVKHenckySVD"):
+        _, _, tau = run(name, hard_states())
+        for k in (0, 2, 8, 9):  # their crushed direction is the third axis
+            assert tau[k, 2, 2] < -2 * MU
+    _, _, tau = run("FixedCorotated", hard_states())
+    assert tau[0, 2, 2] > 0  # times a negative stretch: also back through zero
+
+
+def test_smallest_stretch_is_accurate_in_float32():
+    """H08: from J, with the sign of det F."""
+    F = hard_states(8)[8::12][:3].astype(np.float32)
+    H = jnp.asarray(F - np.eye(3, dtype=np.float32))
+    exact = np.linalg.svd(np.asarray(H, np.float64) + I3)[1][:, 2]
+    sigma, _, _ = jax.jit(jax.vmap(principal_stretches))(H)
+    assert abs(np.asarray(sigma)[:, 2] / exact - 1).max() < 2e-4
+
+
+@pytest.mark.parametrize("law", [pm.StVKHencky, svd.StVKHenckySVD])
+def test_loss_of_ellipticity_and_clamping_are_reported(law):
+    """H42: uniaxial stretch beyond e. H52: a stretch below 1e-4."""
+    elasticity = law(laws.E, laws.NU)
+    stretch = jnp.array([[2.71, 1.0, 1], [2.73, 1, 1], [1.1e-4, 1, 1], [0.9e-4, 1, 1]])
+    H = jax.vmap(jnp.diag)(stretch - 1)
+    elliptic, clamped = (jax.vmap(f)(H) for f in (elasticity.elliptic, elasticity.clamped))
+    assert elliptic.tolist() == [True, False, True, True]
+    assert clamped.tolist() == [False, False, False, True]
+
+
+# --- H39-H41: limits of the parameters -----------------------------------------------------------
+
+
+def limit(name, **values):
+    """Response and derivatives of a law of `LAWS` with other parameters; nothing recompiles."""
+    law = LAWS[name]
+    plasticity = law.material.plasticity
+    for parameter, value in values.items():
+        where = lambda p, parameter=parameter: getattr(getattr(p, "law", p), parameter)  # noqa: E731
+        plasticity = eqx.tree_at(where, plasticity, jnp.asarray(value, jnp.zeros(()).dtype))
+    material = eqx.tree_at(lambda m: m.plasticity, law.material, plasticity)
+    H = laws.strains()
+    arguments = material, H, laws.start(law, len(H))
+    assert laws.all_finite(*arguments)
+    after, _, tau = respond(*arguments)
+    return np.asarray(H), np.asarray(after), np.asarray(tau)
+
+
+METAL = ["VonMises", "VonMises-hardening", "VonMisesSVD"]
+PASTE = ["HerschelBulkley", "HerschelBulkley-h", "HerschelBulkleySVD"]
+SAND = ["DruckerPrager", "DruckerPrager-cohesive", "DruckerPragerSVD"]
+
+
+@pytest.mark.parametrize("name", METAL + PASTE)
+def test_infinite_yield_stress_is_elastic(name):
+    H, after, _ = limit(name, yield_stress=jnp.inf)
+    assert (after == H).all()
+
+
+@pytest.mark.parametrize("name", METAL)
+@pytest.mark.parametrize("tau_Y", [0.0, 1e-12])
+def test_metal_without_strength_bears_no_shear(name, tau_Y):
+    _, _, tau = limit(name, yield_stress=tau_Y)
+    assert norm(dev(tau)).max() < 1e-13 * laws.E + tau_Y
+
+
+@pytest.mark.parametrize("name", PASTE)
+def test_paste_without_strength_and_viscosity_is_an_ideal_fluid(name):
+    _, _, tau = limit(name, yield_stress=0.0, viscosity=0.0)
+    assert norm(dev(tau)).max() < 1e-13 * laws.E
+
+
+@pytest.mark.parametrize("name", PASTE)
+def test_paste_without_viscosity_is_plastic_and_of_infinite_viscosity_elastic(name):
+    H, _, tau = limit(name, viscosity=0.0)
+    flowing = norm(dev(run("DevVolNeoHookean", H + I3)[2])) > (2 / 3) ** 0.5 * 0.7
+    assert flowing.sum() > 20
+    assert abs(norm(dev(tau)) / ((2 / 3) ** 0.5 * 0.7) - 1)[flowing].max() < 1e-12
+    H, after, _ = limit(name, viscosity=jnp.inf)
+    assert norm(after - H).max() < 1e-13
+
+
+@pytest.mark.parametrize("name", SAND)
+def test_sand_without_friction_bears_no_shear_and_keeps_its_pressure(name):
+    H, _, tau = limit(name, friction_angle=0.0)
+    trial = run("StVKHencky", H + I3)[2]
+    assert norm(dev(tau)).max() < 1e-13 * laws.E
+    compressed = np.trace(trial, axis1=1, axis2=2) < 0
+    assert norm(tau - trial + dev(trial))[compressed].max() < 1e-13 * laws.E
+
+
+@pytest.mark.parametrize("name", SAND)
+def test_sand_of_the_steepest_friction_lies_on_its_cone(name):
+    _, _, tau = limit(name, friction_angle=89.999)
+    plasticity = eqx.tree_at(
+        lambda p: getattr(p, "law", p).friction_angle,
+        LAWS[name].material.plasticity,
+        jnp.asarray(89.999),
+    )
+    excess = laws.overshoot(plasticity, LAWS[name].material.elasticity, tau, None)
+    assert excess.max() < 1e-12 * laws.E
+
+
+def test_huge_trial_strain_returns_to_the_surface_in_float32():
+    """H41: a trial stress of a thousand times the yield stress."""
+    F = laws.with_stretches(np.random.default_rng(9), np.array([[2.7, 1, 1 / 2.7]] * 48))
+    for name in ("VonMises", "HerschelBulkley-plastic"):
+        law = LAWS[name]
+        material = eqx.tree_at(lambda m: m.plasticity.yield_stress, law.material, jnp.array(0.007))
+        H = jnp.asarray(F - I3, jnp.float32)
+        material = cast(material, jnp.float32)
+        trial = norm(jax.vmap(lambda H: material.elasticity.kirchhoff(H, H))(H))
+        after, _, tau = respond(material, H, None)
+        assert bool(jnp.isfinite(after).all())
+        excess = laws.overshoot(material.plasticity, material.elasticity, tau, None)
+        assert trial.min() > 1000 * float(material.plasticity.yield_stress)
+        assert (abs(excess) / trial).max() < 1e-6
+
+
+# --- Single precision ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_stress_in_float32_is_accurate_at_every_strain(name):
+    """From H, where from F the error grows as 1e-7/strain."""
+    rng = np.random.default_rng(10)
+    material = cast(LAWS[name].material, jnp.float32)
+    for strain in 10.0 ** -np.repeat(np.arange(1, 7), 8):
+        H = (strain * rng.normal(size=(48, 3, 3))).astype(np.float32)
+        _, _, tau = respond(material, jnp.asarray(H), None)
+        assert tau.dtype == jnp.float32
+        # Exact arithmetic is needed for the smallest strains: the oracle forms F in float64.
+        exact = np.array([EXACT[name](h + I3) for h in H.astype(np.float64)])
+        error = norm(np.asarray(tau) - exact) / norm(exact)
+        assert np.quantile(error, 0.95) < 5e-7
+        assert error.max() < 2e-6

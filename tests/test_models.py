@@ -212,7 +212,7 @@ def states_at_yield(name, n=48):
 @double
 @every_plastic_law
 def test_derivative_at_yield_is_that_of_its_side(name):
-    """The two differ; each is that of a difference towards its side."""
+    """Each is that of a difference towards its side; they differ, unless flow begins smoothly."""
     sides, outwards = states_at_yield(name)
     derivative = []
     for arguments, step in zip(sides, (-1e-5, 1e-5), strict=True):
@@ -220,8 +220,10 @@ def test_derivative_at_yield_is_that_of_its_side(name):
         chosen[0] = eqx.tree_at(lambda t: t[1], chosen[0], outwards)
         forward, mismatch = derivatives(arguments, chosen)
         assert mismatch < 1e-14
-        expected = one_sided_difference(arguments, chosen[0], step)
-        for ours, theirs in zip(forward, expected, strict=True):
-            assert np.abs(np.asarray(ours[0] - theirs)).max() <= 1e-6 * laws.E
         derivative.append(forward[0][0])
-    assert norm(derivative[0] - derivative[1]).min() > 1e-3
+        if LAWS[name].kink:
+            expected = one_sided_difference(arguments, chosen[0], step)
+            for ours, theirs in zip(forward, expected, strict=True):
+                assert np.abs(np.asarray(ours[0] - theirs)).max() <= 1e-6 * laws.E
+    jump = norm(derivative[0] - derivative[1])
+    assert jump.min() > 1e-3 if LAWS[name].kink else jump.max() < 1e-6

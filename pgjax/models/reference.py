@@ -183,9 +183,12 @@ class VonMisesSVD(AbstractPrincipalPlasticity):
         tau_Y = self.law.yield_stress
         if self.law.hardening is not None and history is not None:
             tau_Y = tau_Y + 2 * elasticity.mu * self.law.hardening * history
-        dgamma = jnp.maximum(norm - tau_Y / (2 * elasticity.mu), 0)
+        yields = norm > tau_Y / (2 * elasticity.mu)
+        # The argument is guarded, not the result: an infinite τ_Y must not reach a derivative.
+        dgamma = norm - jnp.where(yields, tau_Y, 0) / (2 * elasticity.mu)
+        dgamma = jnp.where(yields, dgamma, 0)
         new = None if history is None else history + dgamma
-        return jnp.exp(eps - dgamma * direction), dgamma > 0, new
+        return jnp.exp(eps - dgamma * direction), yields, new
 
 
 @final

@@ -21,29 +21,26 @@ TOLERANCES = [
 ]
 
 
-def two_bodies(d, name, *, periodic=False, laws=None):
-    """An elastic and a metal block that spin, vibrate and hit each other; scene, x, v, C."""
+def welded(d, name, *, periodic=False, laws=None):
+    """An elastic and a metal block welded together, spinning and vibrating; scene, x, v, C."""
     rng = np.random.default_rng(11)
     spline, scheme, _ = SCHEMES[name]
-    left = lattice((0.5,) * d, (3,) * d, H)
-    right = lattice((0.83,) + (0.6,) * (d - 1), (3,) * d, H)
-    x = np.concatenate([left, right])
+    x = np.concatenate([lattice((a,) + (0.6,) * (d - 1), (3,) * d, H) for a in (0.5, 0.8)])
     metal = pm.Material(pm.StVKHencky(E, NU), pm.VonMises(200.0), 2000.0)
-    laws = (pm.Material(pm.FixedCorotated(E, NU)), metal) if laws is None else laws
     scene = Scene(
         Grid(np.zeros(d), (16,) * d, H, periodic=(periodic,) * d),
-        laws,
-        H**d / 2**d * rng.uniform(0.8, 1.2, len(x)),
-        counts=(len(left), len(right)),
+        (pm.Material(pm.FixedCorotated(E, NU)), metal) if laws is None else laws,
+        (H / 2) ** d * rng.uniform(0.8, 1.2, len(x)),
+        counts=(len(x) // 2,) * 2,
         spline=spline,
         scheme=scheme,
     )
     spin = rng.normal(size=(d, d))
-    spin = 2 * (spin - spin.T)
-    v = (x - 0.75) @ spin.T + 0.1 * rng.normal(size=x.shape)
-    v[:, 0] += np.where(np.arange(len(x)) < len(left), 0.5, -0.4)
-    # Through a periodic domain the bodies travel; else they stay in the middle.
-    v += 0.5 if periodic else 0.0
+    spin = spin - spin.T
+    spin /= np.linalg.norm(spin)
+    v = x @ spin.T + 0.1 * rng.normal(size=x.shape)
+    # Through a periodic domain the body travels; else it stays in the middle.
+    v += (0.5 if periodic else 0.0) - np.average(v, axis=0, weights=wide(scene.masses))
     return scene, x, v, np.tile(spin, (len(x), 1, 1))
 
 
@@ -51,7 +48,7 @@ def drift(scene, x, v, C, steps, dtype):
     """Largest change of P over `Σ m |v|`, and of L over its magnitude, at any time."""
     start = initial_state(scene, x, v, C=C, dtype=dtype)
     end, (P, L) = roll(scene, start, stable_dt(scene, start), steps, momenta, every=10)
-    assert bool(jnp.all(end.alive))
+    assert bool(jnp.all(end.alive))  # Nothing left the grid, nothing became NaN.
     P0, L0 = momenta(scene, start)
     size = np.sum(wide(scene.masses) * np.linalg.norm(v, axis=1))
     return (
@@ -63,7 +60,7 @@ def drift(scene, x, v, C, steps, dtype):
 @pytest.mark.parametrize(("dtype", "tolerance"), TOLERANCES)
 @pytest.mark.parametrize(("d", "name"), [(2, "cubic-mls"), (3, "quadratic-grad")])
 def test_v20_momenta(measure, d, name, dtype, tolerance):
-    P, L = drift(*two_bodies(d, name), 1000, dtype)
+    P, L = drift(*welded(d, name), 1000, dtype)
     case = f"{name}, {d}-D, 1000 steps, {dtype.__name__}"
     measure("V20", f"P, {case}", P, below=tolerance)
     measure("V20", f"L with its affine part, {case}", L, below=tolerance)
@@ -71,7 +68,7 @@ def test_v20_momenta(measure, d, name, dtype, tolerance):
 
 @pytest.mark.parametrize(("dtype", "tolerance"), TOLERANCES)
 def test_v20_momentum_in_a_periodic_domain(measure, dtype, tolerance):
-    P, _ = drift(*two_bodies(2, "quadratic-mls", periodic=True), 1000, dtype)
+    P, _ = drift(*welded(2, "quadratic-mls", periodic=True), 1000, dtype)
     measure("V20", f"P, periodic, 1000 steps, {dtype.__name__}", P, below=tolerance)
 
 
@@ -79,7 +76,7 @@ def test_v20_momentum_in_a_periodic_domain(measure, dtype, tolerance):
 @pytest.mark.parametrize(("dtype", "tolerance"), TOLERANCES)
 @pytest.mark.parametrize("name", SCHEMES)
 def test_v20_momenta_of_a_long_run(measure, name, dtype, tolerance):
-    P, L = drift(*two_bodies(2, name), 100_000, dtype)
+    P, L = drift(*welded(2, name), 100_000, dtype)
     case = f"{name}, 2-D, 1e5 steps, {dtype.__name__}"
     measure("V20", f"P, {case}", P, below=tolerance)
     measure("V20", f"L with its affine part, {case}", L, below=tolerance)
@@ -101,5 +98,5 @@ class MisprintedHencky(AbstractElasticity):
 @pytest.mark.float64
 def test_v20_fails_with_an_unsymmetric_stress(measure):
     misprinted = pm.Material(MisprintedHencky(E, NU))
-    _, L = drift(*two_bodies(2, "cubic-mls", laws=(misprinted, misprinted)), 200, jnp.float64)
+    _, L = drift(*welded(2, "cubic-mls", laws=(misprinted, misprinted)), 50, jnp.float64)
     measure("V20", "negative control: stress with Vᵀ (E2), L", L, above=1e-6)
