@@ -121,7 +121,10 @@ class StVKHenckySVD(AbstractElasticity):
 
 
 class AbstractPrincipalPlasticity(AbstractPlasticity):
-    """A return mapping `U Z(Σ) Vᵀ`: a new one implements `principal` only."""
+    """A return mapping `U Z(Σ) Vᵀ`: a new one implements `principal` only.
+
+    An inverted particle (det F ≤ 0) does not flow: its stress has to push it back first.
+    """
 
     @abc.abstractmethod
     def principal(
@@ -139,7 +142,10 @@ class AbstractPrincipalPlasticity(AbstractPlasticity):
 
         F = identity(H) + H
         _, yields, new = self.principal(_singular_values(F), history, elasticity, dt)
-        return jnp.where(yields, isotropic(Z, F) - identity(H), H), new
+        upright = det(F) > 0
+        if history is not None:
+            history = jnp.where(upright, new, history)
+        return jnp.where(yields & upright, isotropic(Z, F) - identity(H), H), history
 
     def goes_with(self, elasticity: AbstractElasticity) -> bool:
         """With the Hencky law in either form."""
@@ -272,8 +278,7 @@ class HerschelBulkleySVD(AbstractPrincipalPlasticity):
         s = jnp.where(yields, self.law.flow_stress(s_trial, mu, dt), s_trial)
         S = s / mu * direction
         b = jnp.maximum(S + _isochoric_mean(S), SMALLEST_STRETCH**2)
-        sign = jnp.where(sigma < 0, -1, 1).astype(sigma.dtype)
-        return sign * jnp.cbrt(J) * jnp.sqrt(b), yields, history
+        return jnp.cbrt(J) * jnp.sqrt(b), yields, history
 
 
 def _isochoric_mean(S: Vector3) -> Scalar:
@@ -287,7 +292,7 @@ def _isochoric_mean(S: Vector3) -> Scalar:
     r2, fixed_k = jax.lax.stop_gradient((half / 3, k))
     r = jnp.sqrt(r2)
     single = fixed_k >= r**3
-    a = jnp.cbrt(fixed_k + jnp.sqrt(jnp.where(single, fixed_k**2 - r**6, 0)))
+    a = jnp.cbrt(fixed_k + jnp.sqrt(jnp.maximum(fixed_k**2 - r**6, 0)))
     cosine = jnp.clip(fixed_k / jnp.where(single, 1, r**3), -1, 1)
     c = jnp.where(single, a + r2 / jnp.where(single, a, 1), 2 * r * jnp.cos(jnp.arccos(cosine) / 3))
     residual = c**3 - half * c - 2 * k

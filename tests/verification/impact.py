@@ -23,9 +23,9 @@ STEPS = FRAMES * SUBSTEPS
 # where positions are rounded least.
 BLOCKS = {
     "sand": {"friction_angle": 30.0},
-    "paste": {"yield_stress": 1000.0, "viscosity": 50.0},
-    "shear-thinning paste": {"yield_stress": 1000.0, "viscosity": 500.0, "h": 0.7},
-    "metal": {"yield_stress": 2000.0, "hardening": 0.1},
+    "paste": {"yield_stress": 500.0, "viscosity": 50.0},
+    "shear-thinning paste": {"yield_stress": 500.0, "viscosity": 300.0, "h": 0.7},
+    "metal": {"yield_stress": 1000.0, "hardening": 0.1},
     "cohesive sand": {"friction_angle": 30.0, "cohesion": 0.01},
     "fixed corotated": {},
     "hencky": {},
@@ -33,14 +33,14 @@ BLOCKS = {
     "dev/vol": {},
 }
 COUNT, PER_BLOCK = len(BLOCKS), SIDE**2
-ELASTIC = {"E": 1e5, "nu": 0.3, "density": 1000.0}
+ELASTIC = {"E": 4e4, "nu": 0.3, "density": 1000.0}
 
 
 def parameters() -> dict:
     """All parameters: one value per block, the plastic ones under the name of their block."""
     return {
         **{name: jnp.full((COUNT,), value) for name, value in ELASTIC.items()},
-        "v0": jnp.tile(jnp.asarray([0.5, -1.0]), (COUNT, 1)),
+        "v0": jnp.tile(jnp.asarray([0.3, -1.0]), (COUNT, 1)),
         "x0": jnp.tile(jnp.asarray([0.0, 0.013]), (COUNT, 1)),
         "gravity": jnp.asarray([0.0, -9.8]),
         **{name: jax.tree.map(jnp.asarray, own) for name, own in BLOCKS.items() if own},
