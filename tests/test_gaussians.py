@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pgjax.render import Camera, Gaussians, Similarity, concatenate, deform, render
+from pgjax.render import (
+    Camera,
+    Gaussians,
+    Similarity,
+    bound_stretch,
+    concatenate,
+    deform,
+    render,
+)
 from pgjax.render.gaussians import rotation_of
 from pgjax.render.harmonics import basis, harmonics, rotate_coefficients
 
@@ -214,3 +222,28 @@ def test_shapes_of_a_deformation_are_checked():
     g = random_gaussians()
     with pytest.raises(ValueError, match="`x` and `F` must have shapes"):
         deform(g, g.means[:3], g.factors[:3])
+
+
+def test_bound_stretch_bounds_and_counts():
+    rng = np.random.default_rng(5)
+    F = rng.normal(size=(40, 3, 3)) * np.exp(rng.normal(0, 2, (40, 1, 1)))
+    F[0], F[1] = np.eye(3), np.diag([2.0, 1.0, 0.5])
+    bounded, beyond = bound_stretch(floats(F), 2.0)
+    bounded, beyond = np.asarray(bounded), np.asarray(beyond)
+    sigma = np.linalg.svd(bounded)[1]
+    assert sigma.max() < 2 + 1e-5
+    assert sigma.min() > 0.5 - 1e-5
+    assert not beyond[:2].any()
+    assert beyond[2:].sum() > 30
+    np.testing.assert_array_equal(bounded[~beyond], F[~beyond].astype(bounded.dtype))
+    # Directions and orientation stay: the bounded F has the same singular vectors.
+    U, _, Vt = np.linalg.svd(F[beyond])
+    inner = np.swapaxes(U, 1, 2) @ bounded[beyond] @ np.swapaxes(Vt, 1, 2)
+    off = inner - np.einsum("nii->ni", inner)[:, :, None] * np.eye(3)
+    assert np.abs(off).max() < 1e5 * EPS
+    np.testing.assert_array_equal(np.sign(np.linalg.det(bounded)), np.sign(np.linalg.det(F)))
+
+
+def test_bound_stretch_refuses_to_flatten():
+    with pytest.raises(ValueError, match="`largest` must be at least 1"):
+        bound_stretch(jnp.eye(3)[None], 0.5)

@@ -59,7 +59,7 @@ def test_any_state_has_a_finite_response_and_derivative(name):
     assert laws.all_finite(law.material, H, laws.later(law, len(H)))
 
 
-@pytest.mark.parametrize("name", [*EXACT, "VonMises", "HerschelBulkley-plastic"])
+@pytest.mark.parametrize("name", [*EXACT, "VonMises"])
 def test_any_state_has_a_finite_response_in_float32(name):
     Fe, _, tau = run(name, hard_states(), dtype=jnp.float32)
     assert np.isfinite(Fe).all()
@@ -69,12 +69,14 @@ def test_any_state_has_a_finite_response_in_float32(name):
 @pytest.mark.parametrize("name", laws.PLASTIC)
 def test_plastic_flow_never_stretches_and_leaves_inverted_states_alone(name):
     F = hard_states()
-    history = laws.start(LAWS[name], len(F))
-    Fe, _, _ = run(name, F, history)
-    assert (norm(Fe) <= 1.1 * norm(F) + 2).all()  # sand at the tip: a rotation, of norm √3
-    inverted = np.linalg.det(F) < 0
-    assert inverted.sum() > 8
-    assert (Fe[inverted] - I3 == np.asarray(jnp.asarray(F - I3))[inverted]).all()
+    H = jnp.asarray(F - I3)
+    after = respond(LAWS[name].material, H, laws.start(LAWS[name], len(H)))[0]
+    assert (
+        norm(np.asarray(after) + I3) <= 1.1 * norm(F) + 2
+    ).all()  # the tip of the cone: of norm √3
+    inverted = np.linalg.det(F) < -0.1
+    assert inverted.sum() == 12
+    assert bool((after == H)[jnp.asarray(inverted)].all())
 
 
 @pytest.mark.parametrize("name", ["FixedCorotated", "NeoHookean"])
@@ -192,20 +194,17 @@ def test_sand_of_the_steepest_friction_lies_on_its_cone(name):
     assert excess.max() < 1e-12 * laws.E
 
 
-def test_huge_trial_strain_returns_to_the_surface_in_float32():
-    """H41: a trial stress of a thousand times the yield stress."""
+@pytest.mark.parametrize("name", ["VonMises", "HerschelBulkley-plastic"])
+def test_huge_trial_strain_returns_to_the_surface_in_float32(name):
+    """H41: a trial stress of a thousand times the yield stress, at stretches of about e."""
     F = laws.with_stretches(np.random.default_rng(9), np.array([[2.7, 1, 1 / 2.7]] * 48))
-    for name in ("VonMises", "HerschelBulkley-plastic"):
-        law = LAWS[name]
-        material = eqx.tree_at(lambda m: m.plasticity.yield_stress, law.material, jnp.array(0.007))
-        H = jnp.asarray(F - I3, jnp.float32)
-        material = cast(material, jnp.float32)
-        trial = norm(jax.vmap(lambda H: material.elasticity.kirchhoff(H, H))(H))
-        after, _, tau = respond(material, H, None)
-        assert bool(jnp.isfinite(after).all())
-        excess = laws.overshoot(material.plasticity, material.elasticity, tau, None)
-        assert trial.min() > 1000 * float(material.plasticity.yield_stress)
-        assert (abs(excess) / trial).max() < 1e-6
+    weak = eqx.tree_at(lambda m: m.plasticity.yield_stress, LAWS[name].material, jnp.asarray(0.007))
+    material, H = cast(weak, jnp.float32), jnp.asarray(F - I3, jnp.float32)
+    trial = norm(dev(jax.vmap(lambda H: material.elasticity.kirchhoff(H, H))(H)))
+    _, _, tau = respond(material, H, None)
+    excess = laws.overshoot(material.plasticity, material.elasticity, tau, None)
+    assert trial.min() > 1000 * 0.007
+    assert (abs(excess) / trial).max() < 4e-6
 
 
 # --- Single precision ----------------------------------------------------------------------------
@@ -242,7 +241,7 @@ def test_elastic_constants_out_of_range_are_refused(name, E, below, above):
         law(E, 0.3)
     with pytest.raises(ValueError, match="Argument `nu` must be above -1, but is"):
         law(1.0, below)
-    with pytest.raises(ValueError, match="Argument `nu` must be below 0.5, but is"):
+    with pytest.raises(ValueError, match=r"Argument `nu` must be below 0\.5, but is"):
         law(1.0, above)
     with pytest.raises(ValueError, match="Argument `nu`"):
         law(1.0, [0.3, above])

@@ -144,8 +144,8 @@ class AbstractPrincipalPlasticity(AbstractPlasticity):
         _, yields, new = self.principal(_singular_values(F), history, elasticity, dt)
         upright = det(F) > 0
         if history is not None:
-            history = jnp.where(upright, new, history)
-        return jnp.where(yields & upright, isotropic(Z, F) - identity(H), H), history
+            new = jnp.where(upright, new, history)
+        return jnp.where(yields & upright, isotropic(Z, F) - identity(H), H), new
 
     def goes_with(self, elasticity: AbstractElasticity) -> bool:
         """With the Hencky law in either form."""

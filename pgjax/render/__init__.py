@@ -7,6 +7,7 @@ gradients.
 from pgjax.render.camera import Camera as Camera
 from pgjax.render.gaussians import Gaussians as Gaussians
 from pgjax.render.gaussians import Similarity as Similarity
+from pgjax.render.gaussians import bound_stretch as bound_stretch
 from pgjax.render.gaussians import concatenate as concatenate
 from pgjax.render.gaussians import deform as deform
 from pgjax.render.media import VideoWriter as VideoWriter

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pgjax._types import Array, Float, as_float_array, concrete, require
-from pgjax.linalg import polar
+from pgjax._types import Array, Bool, Float, Scalar, as_float_array, concrete, require
+from pgjax.linalg import isotropic, polar, svd
 from pgjax.render.harmonics import COUNTS
 
 
@@ -195,6 +195,36 @@ def deform(gaussians: Gaussians, x: Float[Array, "n 3"], F: Float[Array, "n 3 3"
         gaussians.sh,
         jnp.einsum("nij,njk->nik", _polar_rotations(F), gaussians.frames),
     )
+
+
+def bound_stretch(
+    F: Float[Array, "n 3 3"], largest: Scalar | float
+) -> tuple[Float[Array, "n 3 3"], Bool[Array, " n"]]:
+    """F with its principal stretches bounded to `[1/largest, largest]`, and where it was.
+
+    Where a material has flowed far (sand, paste) the total F of a point no longer describes its
+    neighbourhood, and a Gaussian drawn with it becomes a veil across the picture. Rotations and
+    the signs of the stretches are kept; what is within the bounds is unchanged.
+
+    Args:
+        F: deformation gradients.
+        largest: at least 1.
+    """
+    require("largest", largest, "be at least 1", lambda a: a >= 1)
+    return _bound_stretch(F, jnp.asarray(largest, F.dtype))
+
+
+@jax.jit
+def _bound_stretch(F: Array, largest: Array) -> tuple[Array, Array]:
+    def one(F: Float[Array, "3 3"]) -> tuple[Array, Array]:
+        def clip(sigma: Float[Array, "3"]) -> Float[Array, "3"]:
+            return jnp.sign(sigma) * jnp.clip(jnp.abs(sigma), 1 / largest, largest)
+
+        _, sigma, _ = svd(F)
+        beyond = jnp.any((jnp.abs(sigma) > largest) | (jnp.abs(sigma) < 1 / largest))
+        return jnp.where(beyond, isotropic(clip, F), F), beyond
+
+    return jax.vmap(one)(F)
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:

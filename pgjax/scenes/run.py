@@ -14,6 +14,7 @@ from pgjax.models import Material
 from pgjax.render import (
     Gaussians,
     VideoWriter,
+    bound_stretch,
     concatenate,
     deform,
     render,
@@ -55,7 +56,7 @@ def run(
     (folder / "ply" if ply_frames else folder).mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     video = folder / "video.mp4"
-    state, ahead = plan.state, _advance(plan, plan.state)
+    state, ahead, bounded = plan.state, _advance(plan, plan.state), 0
     with VideoWriter(video, fps=plan.fps) as writer:
         for frame in range(plan.frames + 1):
             if frame > 0:
@@ -63,7 +64,8 @@ def run(
                 # The next frame is simulated while this one is drawn.
                 if frame < plan.frames and bool(state.status.ok):
                     ahead = _advance(plan, state)
-            gaussians = carried(plan, state.x, state.F)
+            gaussians, count = carried(plan, state.x, state.F)
+            bounded = max(bounded, count)
             image = _draw(plan, gaussians, frame)
             writer.add(image)
             if frame == 0:
@@ -79,7 +81,14 @@ def run(
                 break
     save_image(folder / "last.png", image)
     seconds = time.perf_counter() - started
-    (folder / "run.json").write_text(json.dumps(_record(plan, state, frame, seconds), indent=1))
+    record = _record(plan, state, frame, seconds) | {"most_bounded_gaussians": bounded}
+    (folder / "run.json").write_text(json.dumps(record, indent=1) + "\n")
+    if bounded:
+        warnings.warn(
+            f"Up to {bounded} Gaussians in a frame were drawn with their stretch bounded to "
+            f"`camera.max_stretch` = {plan.view.max_stretch:g}; the simulation is not affected.",
+            stacklevel=2,
+        )
     _report(state.status.messages(), state.status.messages(ERRORS), frame)
     return video
 
@@ -114,10 +123,11 @@ def _nothing(state: State) -> None:
     del state
 
 
-def carried(plan: Plan, x: jax.Array, F: jax.Array) -> Gaussians:
-    """All Gaussians of a frame: the moving ones deformed, the still ones as they were."""
+def carried(plan: Plan, x: jax.Array, F: jax.Array) -> tuple[Gaussians, int]:
+    """All Gaussians of a frame, the moving ones deformed, and how many had their stretch bounded."""
+    F, beyond = bound_stretch(F, plan.view.max_stretch)
     moved = deform(plan.moving, x, F)
-    return concatenate([moved, plan.still]) if len(plan.still) else moved
+    return concatenate([moved, plan.still]) if len(plan.still) else moved, int(beyond.sum())
 
 
 def _draw(plan: Plan, gaussians: Gaussians, frame: int) -> np.ndarray:

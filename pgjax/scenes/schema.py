@@ -80,7 +80,7 @@ class TimePart:
 
 @dataclasses.dataclass(frozen=True)
 class CameraPart:
-    """A camera on an orbit."""
+    """A camera on an orbit, and how the Gaussians are drawn."""
 
     target: Triple
     azimuth: float
@@ -91,6 +91,7 @@ class CameraPart:
     width: int
     height: int
     background: Triple
+    max_stretch: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,6 +215,7 @@ def _camera(t: Table, size: float) -> CameraPart:
         width=t.integer("width", 480, at_least=16),
         height=t.integer("height", 480, at_least=16),
         background=t.vector("background", (1.0, 1.0, 1.0)),
+        max_stretch=t.number("max_stretch", 4.0, at_least=1),
     )
 
 

@@ -1,7 +1,7 @@
 """Nine blocks, one of each material, thrown onto a floor with friction: the scene of the gradients.
 
-The blocks never meet: entry b of the losses depends on the parameters of block b alone, so one
-rollout, one tangent and one cotangent serve all of them.
+The blocks never meet: block b depends on its own parameters alone, so one rollout, one tangent
+and one cotangent serve all of them.
 """
 
 import jax
@@ -15,7 +15,7 @@ from pgjax.models.material import cast
 from pgjax.transfer import Payload, scatter, stencil
 
 # Spacing, particles along a side of a block, cells from one block to the next, node of the floor.
-H, SIDE, APART, FLOOR, FRICTION = 0.1, 8, 13, 3, 0.3
+H, SIDE, APART, FLOOR, FRICTION = 0.1, 8, 15, 3, 0.3
 FRAMES, SUBSTEPS = 10, 50
 STEPS = FRAMES * SUBSTEPS
 
@@ -23,7 +23,7 @@ STEPS = FRAMES * SUBSTEPS
 # where positions are rounded least.
 BLOCKS = {
     "sand": {"friction_angle": 30.0},
-    "paste": {"yield_stress": 500.0, "viscosity": 50.0},
+    "paste": {"yield_stress": 800.0, "viscosity": 50.0},
     "shear-thinning paste": {"yield_stress": 500.0, "viscosity": 300.0, "h": 0.7},
     "metal": {"yield_stress": 1000.0, "hardening": 0.1},
     "cohesive sand": {"friction_angle": 30.0, "cohesion": 0.01},
@@ -66,18 +66,16 @@ def materials(p: dict) -> list[pm.Material]:
     ]
 
 
-def _layout() -> tuple[np.ndarray, np.ndarray]:
-    """Positions of all particles (slightly irregular) and the weights of the loss."""
-    rng = np.random.default_rng(0)
+def _layout() -> np.ndarray:
+    """Positions of all particles, slightly irregular, `(blocks, particles, 2)`."""
     axis = (np.arange(SIDE) + 0.5) * H / 2
     local = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     corners = H * np.stack([3 + APART * np.arange(COUNT), np.full(COUNT, FLOOR)], axis=-1)
-    x = corners[:, None] + local + 1e-3 * rng.standard_normal((COUNT, PER_BLOCK, 2))
-    spread = 2 * local / axis[-1] - 1
-    return x, (0.5 + spread + rng.standard_normal(x.shape)) / PER_BLOCK
+    x = corners[:, None] + local
+    return x + 1e-3 * np.random.default_rng(0).standard_normal(x.shape)
 
 
-POSITIONS, WEIGHTS = _layout()
+POSITIONS = _layout()
 
 
 def scene(p: dict) -> pgjax.Scene:
@@ -101,15 +99,14 @@ def start(p: dict, dtype=jnp.float64) -> pgjax.State:
 
 
 def displacement(state: pgjax.State) -> jax.Array:
-    """Weighted sum of the displacements of each block, m, `(blocks,)`."""
-    moved = state.x.reshape(POSITIONS.shape) - jnp.asarray(POSITIONS, state.dtype)
-    return jnp.sum(jnp.asarray(WEIGHTS, state.dtype) * moved, axis=(1, 2))
+    """What is differentiated: how far every particle moved, m, `(blocks, particles, 2)`."""
+    return state.x.reshape(POSITIONS.shape) - jnp.asarray(POSITIONS, state.dtype)
 
 
-def simulated(p: dict, dt, dtype=jnp.float64) -> jax.Array:
-    """`displacement` after every frame through `simulate`, `(FRAMES, blocks)`."""
+def simulated(p: dict, dt) -> jax.Array:
+    """`displacement` after every frame through `simulate`, `(FRAMES, blocks, particles, 2)`."""
     rollout = pgjax.simulate(
-        scene(p), start(p, dtype), dt=dt, frames=FRAMES, substeps=SUBSTEPS, save=displacement
+        scene(p), start(p), dt=dt, frames=FRAMES, substeps=SUBSTEPS, save=displacement
     )
     return rollout.saved[1:]
 
@@ -118,8 +115,8 @@ def recorded(p: dict, dt, steps, dtype=jnp.float64) -> tuple[jax.Array, dict]:
     """A plain loop of `step`, and what was decided in each of the steps.
 
     Returns:
-        `displacement` after every frame, `(FRAMES, blocks)`, and the record of each step: first
-        node of every stencil, branch of the return map, contact of the nodes below each block.
+        `displacement` after every frame, and the record of each step, one row per block: first
+        node of every stencil, branch of the return map, contact of the nodes of the floor.
     """
     s, dt = cast(scene(p), dtype), jnp.asarray(dt, dtype)
     initial = start(p, dtype)
@@ -135,14 +132,13 @@ def recorded(p: dict, dt, steps, dtype=jnp.float64) -> tuple[jax.Array, dict]:
     def one(i, carry):
         state, record = carry
         after = pgjax.step(s, state, dt)
-        now = decided(state, after) | {"loss": displacement(after)}
+        now = decided(state, after) | {"moved": displacement(after)}
         return after, jax.tree.map(lambda all_, a: all_.at[i].set(a), record, now)
 
-    shapes = jax.eval_shape(lambda a: decided(a, a) | {"loss": displacement(a)}, initial)
+    shapes = jax.eval_shape(lambda a: decided(a, a) | {"moved": displacement(a)}, initial)
     record = jax.tree.map(lambda a: jnp.zeros((STEPS, *a.shape), a.dtype), shapes)
     _, record = jax.lax.fori_loop(0, steps, one, (initial, record))
-    loss = record.pop("loss")
-    return loss[SUBSTEPS - 1 :: SUBSTEPS], record
+    return record.pop("moved")[SUBSTEPS - 1 :: SUBSTEPS], record
 
 
 def _contact(s: pgjax.Scene, state: pgjax.State, at, dt) -> jax.Array:
