@@ -18,9 +18,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     _use_compilation_cache()
-    warnings.showwarning = _print_warning
     try:
-        return options.command(options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            warnings.showwarning = _print_warning
+            return options.command(options)
     except (ValueError, RuntimeError, OSError) as error:
         print(f"pgjax: {error}", file=sys.stderr)
         return 1

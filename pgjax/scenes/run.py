@@ -124,7 +124,7 @@ def _nothing(state: State) -> None:
 
 
 def carried(plan: Plan, x: jax.Array, F: jax.Array) -> tuple[Gaussians, int]:
-    """All Gaussians of a frame, the moving ones deformed, and how many had their stretch bounded."""
+    """All Gaussians of a frame, the moving ones deformed, and how many stretches were bounded."""
     F, beyond = bound_stretch(F, plan.view.max_stretch)
     moved = deform(plan.moving, x, F)
     return concatenate([moved, plan.still]) if len(plan.still) else moved, int(beyond.sum())

@@ -93,7 +93,7 @@ def error(n, d, name, *, scheme=None, **kwargs):
     dt = time_step(n)
     steps = int(1 / SPEED / dt)
     _, x = roll(scene, state, dt, steps, positions, **kwargs)
-    t = dt * jnp.arange(1, steps + 1)
+    t = jnp.asarray(dt * np.arange(1, steps + 1))
     exact = jax.jit(jax.vmap(jax.vmap(wave.place, (0, None)), (None, 0)))(X, t)
     square = np.sum((wide(x) - wide(exact)) ** 2, axis=-1)
     return np.sqrt(np.mean(square, axis=-1)).max() / AMPLITUDE
