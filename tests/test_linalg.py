@@ -94,9 +94,7 @@ def test_decomposition_of_every_class_is_accurate(kind, dtype, measure):
         worst = np.maximum(worst, errors(kind, jnp.asarray(F.astype(dtype))))
     demand = 2e-6 if dtype == np.float32 else 5e-15
     what = f"{kind} of 1e5 matrices, {np.dtype(dtype).name}: "
-    measure(
-        "V14", what + "reconstruction", worst[0], below=2 * demand if kind == "polar" else demand
-    )
+    measure("V14", what + "reconstruction", worst[0], below=demand)
     measure("V14", what + "orthogonality", worst[1], below=demand)
     if kind != "eigenbasis":  # whose basis may be a reflection
         measure("V14", what + "|det − 1|", worst[2], below=demand)
@@ -186,7 +184,7 @@ def test_derivative_is_that_of_finite_differences_in_both_precisions(name):
     forward, reverse = derivative(jnp.asarray(F))
     size = np.maximum(1, abs(np.asarray(forward)).max((1, 2, 3, 4)))
     assert (abs(np.asarray(forward - reverse)).max((1, 2, 3, 4)) / size).max() < 1e-14
-    step = 2e-4  # of a difference of fourth order
+    step = 5e-5  # of a difference of fourth order
     for i in range(3):
         for j in range(3):
             E = step * np.eye(9)[3 * i + j].reshape(3, 3)

@@ -1,8 +1,8 @@
 """The stable time step: its closed form, its use in `simulate`, and what a bad one is told."""
 
+import itertools
 import warnings
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,8 +35,6 @@ def block(E=E, nu=NU, *, d=2, law=pm.FixedCorotated, **kwargs):
     return Scene(Grid(np.zeros(d), (10,) * d, H), material, np.full(len(x), 0.05**d), **kwargs), x
 
 
-@pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.45])
 @pytest.mark.parametrize(
     ("degree", "scheme", "beta"),
     [
@@ -45,14 +43,17 @@ def block(E=E, nu=NU, *, d=2, law=pm.FixedCorotated, **kwargs):
         (3, SplineGradient(), 1.1054),
         (3, MLS(), 1.1547),
     ],
+    ids=["quadratic-grad", "quadratic-mls", "cubic-grad", "cubic-mls"],
 )
-def test_bound_at_rest(measure, degree, scheme, beta, nu, d):
-    scene, _ = block(nu=nu, d=d, spline=BSpline(degree), scheme=scheme)
-    dt = stable_dt(scene, fraction=1.0)
-    measured = dt * sound_speed(E, nu, RHO, d) / H
-    name = f"{type(scheme).__name__}, degree {degree}, ν = {nu}, {d}-D"
-    measure("dt", f"β, {name}", measured, within=(beta - 1e-4, beta + 1e-4))
-    assert stable_dt(scene) == pytest.approx(dt / 2, rel=1e-12)
+def test_bound_at_rest(measure, degree, scheme, beta):
+    worst = 0.0
+    for d, nu in itertools.product((2, 3), (-0.5, 0.0, 0.3, 0.45)):
+        scene, _ = block(nu=nu, d=d, spline=BSpline(degree), scheme=scheme)
+        dt = stable_dt(scene, fraction=1.0)
+        worst = max(worst, abs(dt * sound_speed(E, nu, RHO, d) / H - beta))
+        assert stable_dt(scene) == pytest.approx(dt / 2, rel=1e-12)
+    what = f"|β − {beta}|, {type(scheme).__name__}, degree {degree}, 2-D and 3-D, ν −0.5 to 0.45"
+    measure("dt", what, worst, below=1e-4)
 
 
 def test_damping_of_the_shear_lowers_the_bound():
@@ -116,7 +117,7 @@ def test_a_frame_is_a_whole_number_of_steps(frame):
 
 @F64
 def test_time_is_counted_in_steps(measure):
-    """1e3 frames later the clock still shows whole frames (H54)."""
+    """A hundred frames later the clock still shows whole frames (H54)."""
     scene, x = block()
     frame = 1 / 24
     dt = stable_dt(scene, frame=frame)
@@ -150,7 +151,7 @@ def test_traced_parameter_has_no_time_step():
         jax.jit(lambda E: stable_dt(block(E=E)[0]))(1e4)
 
 
-@pytest.mark.parametrize("dt", [0.0, -1e-3, float("nan"), float("inf"), np.array([1e-3])])
+@pytest.mark.parametrize("dt", [0.0, -1e-3, float("nan"), float("inf"), jnp.full(1, 1e-3)])
 def test_bad_dt_is_refused(dt):
     """H14."""
     scene, x = block()
@@ -258,7 +259,6 @@ def test_bound_of_the_tangent(measure, law):
 
     def largest(H):
         F = jnp.eye(3) + H
-        inverse = jnp.linalg.inv(F)
 
         def of_rate(L):
             def nominal(H):
@@ -266,7 +266,6 @@ def test_bound_of_the_tangent(measure, law):
 
             return jax.jvp(nominal, (H,), (L @ F,))[1] @ F.T
 
-        del inverse
         tangent = jax.vmap(of_rate)(jnp.eye(9).reshape(9, 3, 3)).reshape(9, 9)
         return jnp.linalg.eigvalsh((tangent + tangent.T) / 2)[-1]
 

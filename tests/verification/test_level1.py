@@ -35,10 +35,10 @@ every_elastic_law = pytest.mark.parametrize("name", laws.ELASTIC)
 BATCH = 48  # of the other tests, so that nothing is compiled twice
 
 
-def random_states(count=21, spread=(0.3, 3.0)):
+def random_states(count=21):
     """Deformation gradients `(48 count, 3, 3)`: F = I, diag(1, 1, 2), I + 1e-7, then random."""
     rng = np.random.default_rng(12)
-    stretch = np.exp(rng.uniform(*np.log(spread), (BATCH * count, 3)))
+    stretch = np.exp(rng.uniform(np.log(0.3), np.log(3), (BATCH * count, 3)))
     F = laws.with_stretches(rng, stretch)
     F[:3] = I3, np.diag([1.0, 1, 2]), I3 + 1e-7 * rng.normal(size=(3, 3))
     return F
@@ -65,7 +65,7 @@ def elastic(name):
 
 
 def relative(error, tau):
-    return (norm(error) / np.maximum(norm(tau), 1e-3 * laws.E)).max()
+    return (norm(error) / np.maximum(norm(tau), 1e-2 * laws.E)).max()
 
 
 @every_elastic_law
@@ -187,7 +187,8 @@ def test_v10_return_maps(name, measure):
 
 
 def test_v10_elastic_states_are_returned_bit_by_bit(measure):
-    F = random_states(1, (0.99, 1.01)) * 0.95  # compressed, hardly sheared
+    rng = np.random.default_rng(15)
+    F = laws.with_stretches(rng, rng.uniform(0.94, 0.96, (BATCH, 3)))
     for name in laws.PLASTIC:
         H = jnp.asarray(F - I3)
         after, _, _ = laws.respond(LAWS[name].material, H, laws.start(LAWS[name], BATCH))
@@ -236,7 +237,7 @@ def test_v11_yield_of_metal_in_shear_and_tension(name, measure):
 def test_v12_friction_of_sand_in_triaxial_compression_and_in_shear(measure):
     """C3: exact Mohr–Coulomb in the one, 34.7° in the other (φ = 30°)."""
     sine = 0.5
-    triaxial, shear = principal("DruckerPrager", [[-0.05, -0.05, -0.6], [0.2, -0.4, -0.1]])
+    triaxial, shear = principal("DruckerPrager", [[0.1, 0.1, -0.6], [0.2, -0.4, -0.1]])
     error = abs(triaxial[2] / triaxial[0] * (1 - sine) / (1 + sine) - 1)
     measure("V12", "triaxial compression: σ₁/σ₃ of Mohr–Coulomb", error, below=1e-8)
     alpha = float(LAWS["DruckerPrager"].material.plasticity.alpha)
@@ -263,14 +264,14 @@ def test_v13_flow_rule_of_paste_under_a_constant_rate(name, h, measure):
         def load(s, dt=dt):
             return plasticity.flow_stress(s + 2 * mu * rate * dt, mu, jnp.asarray(dt))
 
-        s = excess = jnp.asarray(s_Y) + 0.01
-        excess = 0.01
-        for _ in range(3):
+        s, excess = jnp.asarray(s_Y + 0.01), 0.01
+        errors = []
+        for _ in range(5):
             s = load(s)
             excess = (excess + 2 * MU * rate * dt) * eta / (eta + 2 * MU * dt)
-            if h == 1:
-                error = abs(float(s) - s_Y - excess) / s_Y
-                measure("V13", f"relaxation in steps of {dt:g} s", error, below=1e-12)
+            errors.append(abs(float(s) - s_Y - excess) / s_Y)
+        if h == 1:
+            measure("V13", f"relaxation in steps of {dt:g} s", max(errors), below=1e-12)
         steady = s_Y + eta * rate**h
         error = abs(float(load(jnp.asarray(steady))) - steady) / s_Y
         measure("V13", f"h = {h}: steady state in steps of {dt:g} s", error, below=1e-12)

@@ -1,0 +1,394 @@
+"""Rollouts: one motion, however it is compiled, cut, batched or sliced; and what moves particles."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pgjax
+import pgjax.models as pm
+from pgjax.boundary import GridVelocity, HalfSpace, ParticleImpulse, ParticleVelocity, Separating
+from pgjax.simulate import checkpointed_scan
+
+H, DT = 0.1, 1e-3
+METAL = pm.Material(pm.StVKHencky(1e4, 0.3), pm.VonMises(50.0, hardening=0.1), density=1000.0)
+JELLY = pm.Material(pm.NeoHookean(2e4, 0.2), density=500.0)
+advance = eqx.filter_jit(pgjax.step)
+
+
+def particles(n, seed=0, lower=0.4, size=0.3, d=2):
+    """Random positions and velocities."""
+    rng = np.random.default_rng(seed)
+    return lower + size * rng.random((n, d)), rng.normal(size=(n, d))
+
+
+def two_bodies(**kwargs):
+    """Six particles of metal and six of jelly falling on a floor with friction."""
+    x, v = particles(12)
+    floor = HalfSpace([0.0, 0.43], [0.0, 1.0], Separating(0.3))
+    scene = pgjax.Scene(
+        pgjax.Grid([0.0, 0.0], (12, 12), H),
+        [METAL, JELLY],
+        np.full(12, 1e-3),
+        counts=(6, 6),
+        gravity=[0.0, -9.8],
+        boundaries=(floor,),
+        **kwargs,
+    )
+    return scene, pgjax.initial_state(scene, x, v)
+
+
+def one_body(material=JELLY, n=9, x=None, v=None, **kwargs):
+    """A free body in the middle of the grid."""
+    start, speed = particles(n)
+    start = start if x is None else x
+    kwargs = {"grid": pgjax.Grid([0.0, 0.0], (12, 12), H)} | kwargs
+    scene = pgjax.Scene(kwargs.pop("grid"), material, np.full(len(start), 1e-3), **kwargs)
+    return scene, pgjax.initial_state(scene, start, speed if v is None else v)
+
+
+def run(scene, state, steps, dt=DT):
+    for _ in range(steps):
+        state = advance(scene, state, dt)
+    return state
+
+
+def difference(a, b):
+    """Largest difference of two trees, relative to the largest entry of each array."""
+    gaps = [0.0]
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+        assert x.shape == y.shape
+        gaps.append(np.max(np.abs(x - y), initial=0) / max(np.max(np.abs(y), initial=0), 1e-300))
+    return max(gaps)
+
+
+def identical(a, b):
+    return all(
+        np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
+
+
+def kept(states):
+    """What `simulate` saves by default, of a list of states."""
+    return jax.tree.map(lambda *a: jnp.stack(a), *[pgjax.Kinematics(s.x, s.v, s.F) for s in states])
+
+
+def test_jit_scan_and_loop_are_one(measure):
+    """V44. Entry 0 of what is saved is the initial state; a restart changes no bit."""
+    scene, state = two_bodies()
+    eager, jitted = pgjax.step(scene, state, DT), advance(scene, state, DT)
+    measure("V44", "jit = eager, one step", difference(jitted, eager), below=1e-13)
+    loop = [state]
+    for _ in range(4):
+        loop.append(run(scene, loop[-1], 5))
+    whole = pgjax.simulate(scene, state, dt=DT, frames=4, substeps=5)
+    measure("V44", "scan = loop, 20 steps", difference(whole.saved, kept(loop)), below=1e-13)
+    measure("V44", "scan = loop, final state", difference(whole.final, loop[-1]), below=1e-13)
+    assert identical(jax.tree.map(lambda a: a[:1], whole.saved), kept([state]))
+    np.testing.assert_allclose(whole.t, 5 * DT * np.arange(5), rtol=1e-14)
+
+    half = pgjax.simulate(scene, state, dt=DT, frames=2, substeps=5)
+    rest = pgjax.simulate(scene, half.final, dt=DT, frames=2, substeps=5)
+    assert identical(rest.final, whole.final)
+    assert identical(rest.saved, jax.tree.map(lambda a: a[2:], whole.saved))
+    np.testing.assert_array_equal(rest.t, whole.t[2:])
+
+
+def test_batch_of_scenes(measure):
+    """V44: `vmap` over E equals separate runs, and a member that fails disturbs no other."""
+
+    def motion(E):
+        scene, state = one_body(pm.Material(pm.NeoHookean(E, 0.3), density=1000.0))
+        return pgjax.simulate(scene, state, dt=DT, frames=2, substeps=10)
+
+    batched = eqx.filter_jit(jax.vmap(motion))
+    stiffness = jnp.asarray([5e3, 1e4, 2e4])
+    batch = batched(stiffness)
+    separate = [motion(E) for E in stiffness]
+    stacked = jax.tree.map(lambda *a: jnp.stack(a), *separate)
+    measure(
+        "V44", "vmap over scenes = separate", difference(batch.saved, stacked.saved), below=1e-13
+    )
+    assert batch.status.ok.all()
+
+    broken = batched(stiffness.at[1].set(jnp.nan))
+    np.testing.assert_array_equal(broken.status.ok, [True, False, True])
+    np.testing.assert_array_equal(
+        broken.status.happened(pgjax.Condition.NONFINITE), [False, True, False]
+    )
+    others = jnp.asarray([0, 2])
+    for good, bad in zip(jax.tree.leaves(batch), jax.tree.leaves(broken), strict=True):
+        np.testing.assert_array_equal(good[others], bad[others])
+    assert np.isfinite(broken.saved.x).all()
+
+
+def test_save_takes_any_function_and_a_new_number_does_not_compile():
+    """`save` returns any tree; it is traced once, however many values E, dt and gravity take."""
+    traced = []
+
+    def save(state):
+        traced.append(1)
+        return {"step": state.step, "top": jnp.max(state.x[:, 1]), "nothing": None}
+
+    def motion(E, dt, g):
+        material = pm.Material(pm.NeoHookean(E, 0.3), density=1000.0)
+        scene, state = one_body(material, gravity=[0.0, g])
+        return pgjax.simulate(scene, state, dt=dt, frames=3, substeps=4, save=save)
+
+    first = motion(1e4, DT, -1.0)
+    assert set(first.saved) == {"step", "top", "nothing"}
+    np.testing.assert_array_equal(first.saved["step"], [0, 4, 8, 12])
+    count = len(traced)
+    tops = [motion(*values).saved["top"][-1] for values in ((2e4, DT, -1), (1e4, 2 * DT, 3.0))]
+    assert len(traced) == count
+    assert len({float(first.saved["top"][-1]), *map(float, tops)}) == 3
+
+
+def test_progress_is_reported_once_per_frame():
+    scene, state = one_body()
+    seen = []
+    pgjax.simulate(
+        scene, state, dt=DT, frames=7, substeps=2, progress=lambda *frame: seen.append(frame)
+    )
+    jax.effects_barrier()
+    assert sorted(seen) == [(frame, 7) for frame in range(1, 8)]
+
+
+@pytest.mark.float64
+def test_float32_stays_float32():
+    """H47: a float32 state in a float64 scene gives float32 everywhere, and float64 likewise."""
+    for dtype in (jnp.float32, jnp.float64):
+        scene, state = two_bodies()
+        state = pgjax.initial_state(scene, state.x, state.v, dtype=dtype)
+        result = jax.eval_shape(
+            lambda state, scene=scene: pgjax.simulate(scene, state, dt=DT, frames=2, substeps=3),
+            state,
+        )
+        floating = [a for a in jax.tree.leaves(result) if jnp.issubdtype(a.dtype, jnp.floating)]
+        assert {a.dtype for a in floating} == {jnp.dtype(dtype)}
+        assert len(floating) == 13
+
+
+@pytest.mark.float64
+@pytest.mark.parametrize("count", [1, 2, 7, 12, 13, 37])
+@pytest.mark.parametrize("group", [1, 4, 6, 50])
+def test_checkpointed_scan_is_a_scan(count, group):
+    """Any number of steps in any groups: same values, same order, same gradient."""
+
+    def body(a, i):
+        new = jnp.sin(a) + 0.1 * i.astype(a.dtype)
+        return new, {"a": new, "i": i}
+
+    def cut(a):
+        return checkpointed_scan(body, a, count, group=group)
+
+    def plain(a):
+        return jax.lax.scan(body, a, jnp.arange(count, dtype=jnp.int32))
+
+    a = jnp.asarray([0.3, 1.2])
+    assert identical(cut(a), plain(a))
+
+    def gradient(scan):
+        def total(a):
+            final, out = scan(a)
+            return jnp.sum(final) + jnp.sum(out["a"] ** 2)
+
+        return jax.grad(total)(a)
+
+    np.testing.assert_allclose(gradient(cut), gradient(plain), rtol=1e-13)
+
+
+@pytest.mark.parametrize(("frames", "substeps"), [(5, 7), (1, 13), (13, 1), (6, 4)])
+def test_any_number_of_frames_and_substeps(frames, substeps, measure):
+    """Odd and prime numbers: nothing is skipped, nothing is done twice."""
+    scene, state = one_body()
+    result = pgjax.simulate(scene, state, dt=DT, frames=frames, substeps=substeps)
+    states = [state]
+    for _ in range(frames):
+        states.append(run(scene, states[-1], substeps))
+    assert result.final.step == frames * substeps
+    gap = difference(result.saved, kept(states))
+    measure("V44", f"scan = loop, {frames} x {substeps} steps", gap, below=1e-13)
+
+
+@pytest.mark.parametrize("frames", [1, 32])
+def test_reverse_mode_memory_grows_as_the_root(frames, measure):
+    """Four times the steps need about twice the memory, as one long frame and as many short."""
+    scene, state = one_body(n=400)
+
+    def memory(steps):
+        def loss(v):
+            moving = eqx.tree_at(lambda s: s.v, state, v)
+            n = frames * steps // 64
+            motion = pgjax.simulate(
+                scene, moving, dt=DT, frames=n, substeps=steps // n, save=lambda s: None
+            )
+            return jnp.sum(motion.final.x)
+
+        compiled = jax.jit(jax.grad(loss)).lower(state.v).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    growth = memory(256) / memory(64)
+    what = "one frame" if frames == 1 else "many frames"
+    measure("V44", f"reverse-mode memory, 256 against 64 steps, {what}", growth, below=2.6)
+
+
+def test_materials_far_apart_do_not_meet(measure):
+    """H43: slices of one scene equal separate scenes."""
+    x, v = particles(12, size=0.2)
+    x = x + 0.6 * (np.arange(12) >= 6)[:, None] - 0.2
+    grid = pgjax.Grid([0.0, 0.0], (12, 12), H)
+    scene = pgjax.Scene(grid, [METAL, JELLY], np.full(12, 1e-3), counts=(6, 6))
+    together = run(scene, pgjax.initial_state(scene, x, v), 30)
+    for material, part in ((METAL, slice(0, 6)), (JELLY, slice(6, 12))):
+        alone_in, state = one_body(material, x=x[part], v=v[part])
+        alone = run(alone_in, state, 30)
+        gap = difference(
+            (together.x[part], together.v[part], together.C[part], together.Fe[part]),
+            (alone.x, alone.v, alone.C, alone.Fe),
+        )
+        law = type(material.elasticity).__name__
+        measure("H43", f"{law} beside another material = alone, 30 steps", gap, below=1e-13)
+
+
+def test_values_per_particle_are_slices(measure):
+    """One material with a value per particle equals two materials."""
+    x, v = particles(12)
+    first = np.arange(12) < 6
+
+    def of(E, nu, density, strength, hardening):
+        plasticity = pm.VonMises(strength, hardening=hardening)
+        return pm.Material(pm.StVKHencky(E, nu), plasticity, density=density)
+
+    one, two = (1e4, 0.3, 1000.0, 50.0, 0.1), (2e4, 0.1, 500.0, 80.0, 0.0)
+    grid, volumes = pgjax.Grid([0.0, 0.0], (12, 12), H), np.full(12, 1e-3)
+    sliced = pgjax.Scene(grid, [of(*one), of(*two)], volumes, counts=(6, 6))
+    values = [np.where(first, a, b) for a, b in zip(one, two, strict=True)]
+    mixed = pgjax.Scene(grid, of(*values), volumes)
+    a, b = (run(s, pgjax.initial_state(s, x, v), 30) for s in (mixed, sliced))
+    gap = difference((a.x, a.v, a.C, a.Fe, a.F), (b.x, b.v, b.C, b.Fe, b.F))
+    assert np.abs(np.asarray(a.He - a.H)).max() > 1e-3
+    measure("V44", "values per particle = slices, 30 steps", gap, below=1e-13)
+
+
+def test_periodic_direction(measure):
+    """A body that crosses the seam moves as one that does not, and returns after one period."""
+    grid = pgjax.Grid([0.0, 0.0], (8, 12), H, periodic=(True, False))
+    x, v = particles(9, size=0.25)
+    v = 0.2 * v + np.array([20.0, 0.0])
+    scene, state = one_body(x=x, v=v, grid=grid)
+    at_seam = pgjax.initial_state(scene, x + np.array([3 * H, 0.0]), v)
+    inside, across = run(scene, state, 40), run(scene, at_seam, 40)
+    assert (across.x[:, 0] > 0.8).any()
+    assert across.alive.all()
+    gap = difference(
+        (inside.position[:, 0] + 3 * H, inside.x[:, 1], inside.v, inside.He),
+        (across.position[:, 0], across.x[:, 1], across.v, across.He),
+    )
+    measure("V44", "across the periodic seam = inside, 40 steps", gap, below=1e-12)
+
+
+def test_plane_strain_is_a_slab(measure):
+    """d = 2 equals d = 3 one cell wide and periodic, plastic flow included."""
+    x, v = particles(10)
+    flat, state = one_body(METAL, x=x, v=v)
+    box = pgjax.Grid([0.0, 0.0, 0.0], (12, 12, 1), H, periodic=(False, False, True))
+    slab = pgjax.Scene(box, METAL, np.full(10, 1e-3 * H))
+    thick = pgjax.initial_state(
+        slab, np.pad(x, ((0, 0), (0, 1)), constant_values=0.03), np.pad(v, ((0, 0), (0, 1)))
+    )
+    flat_end, slab_end = run(flat, state, 50), run(slab, thick, 50)
+    gap = difference(
+        (flat_end.x, flat_end.v, flat_end.C, flat_end.He, flat_end.H, flat_end.history),
+        (
+            slab_end.x[:, :2],
+            slab_end.v[:, :2],
+            slab_end.C[:, :2, :2],
+            slab_end.He,
+            slab_end.H,
+            slab_end.history,
+        ),
+    )
+    assert np.abs(flat_end.He[:, 2, 2]).max() > 1e-4
+    assert np.abs(slab_end.v[:, 2]).max() < 1e-12
+    measure("V21", "d = 2 against a periodic slab, 50 steps", gap, below=1e-10)
+
+
+def test_particle_velocity_is_followed_exactly(measure):
+    """Held particles move with the value while the window lasts, whatever pulls at them."""
+    held = np.arange(9) < 4
+    value, start, end = np.array([0.3, -0.2]), 10 * DT, 30 * DT
+    hold = ParticleVelocity(held, value, start=start, end=end)
+    scene, state = one_body(gravity=[0.0, -9.8], particle_conditions=(hold,))
+    before = run(scene, state, 10)
+    during = run(scene, before, 20)
+    exact = before.x[held] + 20 * DT * value
+    measure("V44", "held particles", np.max(np.abs(during.x[held] - exact)), below=1e-14)
+    np.testing.assert_array_equal(during.v[held], np.tile(value, (4, 1)))
+    assert not np.allclose(before.v[held], value)
+    after = run(scene, during, 5)
+    assert not np.allclose(after.v[held], value)
+
+
+def test_grid_velocity_moves_with_its_box():
+    """Nodes in the box have the velocity in the window: the particles inside follow it."""
+    velocity = np.array([0.5, 0.25])
+    push = GridVelocity([0.55, 0.55], [0.35, 0.35], velocity, start=2 * DT, end=6 * DT)
+    scene, state = one_body(boundaries=(push,))
+    before = run(scene, state, 2)
+    assert not np.allclose(before.v, velocity)
+    during = run(scene, before, 4)
+    np.testing.assert_allclose(during.v, np.tile(velocity, (9, 1)), rtol=1e-12)
+    np.testing.assert_allclose(during.x, before.x + 4 * DT * velocity, rtol=1e-12)
+    after = run(scene, during, 20)
+    assert np.abs(after.v - velocity).max() > 1e-6
+
+
+@pytest.mark.parametrize("duration", [0.0, 0.0125])
+def test_impulse_is_a_total_momentum(duration, measure):
+    """It depends neither on the number of particles nor on the time step, nor how they meet."""
+    momentum, gaps = np.array([0.02, -0.01]), []
+    for n in (5, 20):
+        push = ParticleImpulse(np.arange(n) < n // 2, momentum, start=0.0033, duration=duration)
+        scene, state = one_body(n=n, v=np.zeros((n, 2)), particle_conditions=(push,))
+        for dt in (DT, 0.7 * DT):
+            assert (run(scene, state, 3, dt).v == 0).all()
+            end = run(scene, state, int(0.03 / dt), dt)
+            total = np.sum(scene.masses[:, None] * end.v, axis=0)
+            gaps.append(np.max(np.abs(total - momentum)) / np.max(np.abs(momentum)))
+    measure("V44", f"total momentum of a push of {duration} s", max(gaps), below=1e-12)
+
+
+def test_damping_does_not_depend_on_the_time_step(measure):
+    """`v ∝ exp(−γ t)` and the symmetric part of C ∝ exp(−r t), to rounding, for any dt."""
+    gamma, r, duration = 3.0, 40.0, 0.02
+    # Too soft to feel its own stress.
+    dust = pm.Material(pm.NeoHookean(1e-9, 0.3), density=1000.0)
+    C = np.array([[[1.0, 3.0], [-2.0, 0.5]]])
+    symmetric, spin = (C + C.swapaxes(1, 2)) / 2, (C - C.swapaxes(1, 2)) / 2
+    damping = {"grid_damping": gamma, "shear_damping": r}
+    scene, state = one_body(dust, x=np.array([[0.52, 0.57]]), v=np.array([[0.4, 0.2]]), **damping)
+    state = eqx.tree_at(lambda s: s.C, state, jnp.asarray(C))
+    slow = np.exp(-gamma * duration)
+    for steps in (10, 40):
+        end = run(scene, state, steps, duration / steps)
+        speed = difference(end.v, slow * state.v)
+        measure("V44", f"grid damping, {steps} steps", speed, below=1e-12)
+        exact = slow * (spin + np.exp(-r * duration) * symmetric)
+        measure("V44", f"shear damping, {steps} steps", difference(end.C, exact), below=1e-10)
+
+
+def test_body_force(measure):
+    """`v = Σ Δt b(X0, t)` for particles that do not touch, each with its own X0."""
+    x = np.array([[0.2, 0.3], [0.9, 0.8]])
+
+    def push(X0, t):
+        return jnp.stack([X0[1] * jnp.cos(50 * t), -X0[0] * t])
+
+    scene, state = one_body(x=x, v=np.zeros((2, 2)), body_force=push, X0=x)
+    end = run(scene, state, 20)
+    t = DT * np.arange(20)
+    exact = DT * np.stack([x[:, 1] * np.cos(50 * t).sum(), -x[:, 0] * t.sum()], axis=1)
+    measure("V44", "body force on free particles", difference(end.v, exact), below=1e-12)
