@@ -10,9 +10,7 @@ from test_models import derivatives, directions
 
 import pgjax.models as pm
 import pgjax.models.reference as svd
-from pgjax.grid import Grid
-from pgjax.scene import Scene, initial_state
-from pgjax.step import step
+from pgjax.models.material import particle_axes
 
 PAIRS = [name for name, law in LAWS.items() if law.fast]
 
@@ -56,21 +54,16 @@ def test_reference_remembers_and_reports_what_the_fast_law_does(name):
         assert bool((a == b).all())
 
 
-@pytest.mark.float64
-def test_reference_laws_are_selectable_in_a_scene():
-    """A step of metal with either form; the yield stress given per particle."""
-    n = 6
-    rng = np.random.default_rng(0)
-    x, F = 0.3 + 0.4 * rng.random((n, 3)), laws.deformations(n=30)[-n:]
-    strength = np.linspace(0.1, 0.6, n)
-    ends = []
+def test_parameters_may_be_given_per_particle():
+    H = laws.strains()
+    answers = []
     for elasticity, plasticity in (
-        (pm.StVKHencky(laws.E, 0.3), pm.VonMises(strength)),
-        (svd.StVKHenckySVD(laws.E, 0.3), svd.VonMisesSVD(strength)),
+        (pm.StVKHencky, pm.VonMises),
+        (svd.StVKHenckySVD, svd.VonMisesSVD),
     ):
-        material = pm.Material(elasticity, plasticity)
-        scene = Scene(Grid(np.zeros(3), (10, 10, 10), 0.1), material, np.full(n, 1e-3))
-        state = initial_state(scene, x, np.zeros((n, 3)), F=F)
-        ends.append(jax.jit(lambda s, scene=scene: step(scene, s, 1e-3))(state))
-    np.testing.assert_allclose(ends[0].He, ends[1].He, atol=1e-12)
-    np.testing.assert_allclose(ends[0].C, ends[1].C, atol=1e-12)
+        strength = np.linspace(0.1, 0.6, len(H))
+        material = pm.Material(elasticity(laws.E, laws.NU), plasticity(strength))
+        axes = particle_axes(material, len(H)), 0, None, None
+        respond_to = jax.jit(jax.vmap(laws.answer, in_axes=axes))
+        answers.append(respond_to(material, H, None, jnp.asarray(laws.DT)))
+    assert gap(*answers) < 1e4 * float(jnp.finfo(H.dtype).eps)

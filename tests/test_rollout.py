@@ -1,4 +1,4 @@
-"""Rollouts: one motion, however it is compiled, cut, batched or sliced; and what moves particles."""
+"""Rollouts: one motion, however it is compiled, cut, batched or sliced; and what drives it."""
 
 import equinox as eqx
 import jax
@@ -77,9 +77,10 @@ def kept(states):
 
 def test_jit_scan_and_loop_are_one(measure):
     """V44. Entry 0 of what is saved is the initial state; a restart changes no bit."""
-    scene, state = two_bodies()
-    eager, jitted = pgjax.step(scene, state, DT), advance(scene, state, DT)
+    jelly, at_rest = one_body()
+    eager, jitted = pgjax.step(jelly, at_rest, DT), advance(jelly, at_rest, DT)
     measure("V44", "jit = eager, one step", difference(jitted, eager), below=1e-13)
+    scene, state = two_bodies()
     loop = [state]
     for _ in range(4):
         loop.append(run(scene, loop[-1], 5))
@@ -168,35 +169,33 @@ def test_float32_stays_float32():
         )
         floating = [a for a in jax.tree.leaves(result) if jnp.issubdtype(a.dtype, jnp.floating)]
         assert {a.dtype for a in floating} == {jnp.dtype(dtype)}
-        assert len(floating) == 13
 
 
 @pytest.mark.float64
-@pytest.mark.parametrize("count", [1, 2, 7, 12, 13, 37])
+@pytest.mark.parametrize("count", [1, 2, 12, 13, 37])
 @pytest.mark.parametrize("group", [1, 4, 6, 50])
 def test_checkpointed_scan_is_a_scan(count, group):
     """Any number of steps in any groups: same values, same order, same gradient."""
+    _, state = one_body(n=2)
 
-    def body(a, i):
-        new = jnp.sin(a) + 0.1 * i.astype(a.dtype)
-        return new, {"a": new, "i": i}
+    def body(state, i):
+        v = jnp.sin(state.v) + 0.1 * i.astype(state.dtype)
+        return eqx.tree_at(lambda s: (s.v, s.step), state, (v, state.step + 1)), {"v": v, "i": i}
 
-    def cut(a):
-        return checkpointed_scan(body, a, count, group=group)
+    def cut(state):
+        return checkpointed_scan(body, state, count, group=group)
 
-    def plain(a):
-        return jax.lax.scan(body, a, jnp.arange(count, dtype=jnp.int32))
-
-    a = jnp.asarray([0.3, 1.2])
-    assert identical(cut(a), plain(a))
+    def plain(state):
+        return jax.lax.scan(body, state, jnp.arange(count, dtype=jnp.int32))
 
     def gradient(scan):
-        def total(a):
-            final, out = scan(a)
-            return jnp.sum(final) + jnp.sum(out["a"] ** 2)
+        def total(v):
+            final, out = scan(eqx.tree_at(lambda s: s.v, state, v))
+            return jnp.sum(final.v) + jnp.sum(out["v"] ** 2)
 
-        return jax.grad(total)(a)
+        return jax.grad(total)(state.v)
 
+    assert identical(cut(state), plain(state))
     np.testing.assert_allclose(gradient(cut), gradient(plain), rtol=1e-13)
 
 
@@ -213,26 +212,30 @@ def test_any_number_of_frames_and_substeps(frames, substeps, measure):
     measure("V44", f"scan = loop, {frames} x {substeps} steps", gap, below=1e-13)
 
 
-@pytest.mark.parametrize("frames", [1, 32])
-def test_reverse_mode_memory_grows_as_the_root(frames, measure):
-    """Four times the steps need about twice the memory, as one long frame and as many short."""
+@pytest.mark.parametrize("substeps", [None, 8], ids=["one-frame", "many-frames"])
+def test_reverse_mode_memory_grows_as_the_root(substeps, measure):
+    """2√T + 60 states for T steps, in one long frame and in many short ones."""
     scene, state = one_body(n=400)
+    size = sum(a.nbytes for a in (state.position, state.v, state.C, state.He))
 
-    def memory(steps):
+    def states_held(steps):
+        n = substeps or steps
+
         def loss(v):
             moving = eqx.tree_at(lambda s: s.v, state, v)
-            n = frames * steps // 64
             motion = pgjax.simulate(
-                scene, moving, dt=DT, frames=n, substeps=steps // n, save=lambda s: None
+                scene, moving, dt=DT, frames=steps // n, substeps=n, save=lambda s: s.step
             )
             return jnp.sum(motion.final.x)
 
         compiled = jax.jit(jax.grad(loss)).lower(state.v).compile()
-        return compiled.memory_analysis().temp_size_in_bytes
+        return compiled.memory_analysis().temp_size_in_bytes / size
 
-    growth = memory(256) / memory(64)
-    what = "one frame" if frames == 1 else "many frames"
-    measure("V44", f"reverse-mode memory, 256 against 64 steps, {what}", growth, below=2.6)
+    short, long = states_held(256), states_held(1024)
+    what = f"reverse mode, {'one frame' if substeps is None else 'many frames'}"
+    measure("V44", f"{what}: states held, 256 steps", short, below=2 * 16 + 60)
+    measure("V44", f"{what}: states held, 1024 steps", long, below=2 * 32 + 60)
+    measure("V44", f"{what}: memory, 1024 against 256 steps", long / short, below=2.6)
 
 
 def test_materials_far_apart_do_not_meet(measure):
@@ -324,7 +327,7 @@ def test_particle_velocity_is_followed_exactly(measure):
     scene, state = one_body(gravity=[0.0, -9.8], particle_conditions=(hold,))
     before = run(scene, state, 10)
     during = run(scene, before, 20)
-    exact = before.x[held] + 20 * DT * value
+    exact = np.asarray(before.x)[held] + 20 * DT * value
     measure("V44", "held particles", np.max(np.abs(during.x[held] - exact)), below=1e-14)
     np.testing.assert_array_equal(during.v[held], np.tile(value, (4, 1)))
     assert not np.allclose(before.v[held], value)
@@ -341,9 +344,10 @@ def test_grid_velocity_moves_with_its_box():
     assert not np.allclose(before.v, velocity)
     during = run(scene, before, 4)
     np.testing.assert_allclose(during.v, np.tile(velocity, (9, 1)), rtol=1e-12)
-    np.testing.assert_allclose(during.x, before.x + 4 * DT * velocity, rtol=1e-12)
+    exact = np.asarray(before.x) + 4 * DT * velocity
+    np.testing.assert_allclose(during.x, exact, rtol=1e-12)
     after = run(scene, during, 20)
-    assert np.abs(after.v - velocity).max() > 1e-6
+    assert np.abs(np.asarray(after.v) - velocity).max() > 1e-6
 
 
 @pytest.mark.parametrize("duration", [0.0, 0.0125])
