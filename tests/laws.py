@@ -16,6 +16,8 @@ from pgjax.models.elasticity import volume_change
 from pgjax.models.material import cast
 
 E, NU, DT = 7.0, 0.3, 0.01
+# Derivatives run for milliseconds and compile for seconds: without optimisation in half of them.
+UNOPTIMISED = {"xla_backend_optimization_level": 0}
 I3 = np.eye(3)
 
 
@@ -132,7 +134,7 @@ def respond(material, H, history, dt=None):
     return jax.vmap(answer, in_axes=(None, 0, 0, None))(material, H, history, dt)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=UNOPTIMISED)
 def energies(elasticity, H):
     """Energy and `(∂W/∂F) Fᵀ` for many particles."""
 
@@ -194,7 +196,7 @@ def overshoot(plasticity, elasticity, tau, history):
     return s + float(law.alpha) * (np.trace(np.asarray(tau), axis1=1, axis2=2) - tip)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=UNOPTIMISED)
 def linear_response(material, H, history, directions, cotangent):
     """Forward derivatives along each of the directions, and the reverse one of a cotangent.
 

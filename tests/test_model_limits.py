@@ -337,7 +337,7 @@ def test_parameters_are_arrays_so_that_a_new_value_does_not_recompile(name):
 # --- Bound of the tangent ------------------------------------------------------------------------
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=laws.UNOPTIMISED)
 def tangents(elasticity, H):
     """Matrices `(p, 9, 9)` of `L ↦ dτ − τ Lᵀ` along `dF = L F`, and bounds for d = 3 and 2."""
     basis = jnp.eye(9).reshape(9, 3, 3)
