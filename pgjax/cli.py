@@ -68,12 +68,11 @@ def _run(options: argparse.Namespace) -> int:
     folder = options.out or _next_folder(planned.name)
     print(summary(planned))
     with tqdm(total=planned.frames, unit="frame", file=sys.stderr) as bar:
-        video = run(
-            planned,
-            folder,
-            ply_frames=options.save_ply,
-            progress=lambda frame, _: bar.update(frame - bar.n),
-        )
+
+        def show(frame: int, _: int) -> None:
+            bar.update(frame - bar.n)
+
+        video = run(planned, folder, ply_frames=options.save_ply, progress=show)
     print(f"wrote      {video}")
     return 0
 
@@ -90,6 +89,7 @@ def _next_folder(name: str) -> Path:
 def _info(options: argparse.Namespace) -> int:
     del options
     import jax
+    import jax.numpy as jnp
 
     from pgjax.scenes import presets
 
@@ -100,8 +100,9 @@ def _info(options: argparse.Namespace) -> int:
     devices = jax.devices()
     print(f"devices    {', '.join(f'{d.platform} ({d.device_kind})' for d in devices)}")
     print(f"threads    {os.cpu_count()}")
-    print(f"precision  {'double' if jax.config.jax_enable_x64 else 'single'} (JAX_ENABLE_X64)")
-    print(f"cache      {jax.config.jax_compilation_cache_dir}")
+    double = jnp.zeros(()).dtype == jnp.float64
+    print(f"precision  {'double' if double else 'single'} (JAX_ENABLE_X64)")
+    print(f"cache      {os.environ['JAX_COMPILATION_CACHE_DIR']}")
     print(f"presets    {', '.join(presets())}")
     version = metadata.version("jaxlib")
     if version in _SLOW_SCATTER and any(d.platform == "gpu" for d in devices):

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pgjax._types import require
 
@@ -75,8 +75,8 @@ def neighbour_volumes(x: np.ndarray) -> np.ndarray:
     first, last = _NEIGHBOURS
     last = min(last, len(x) - 1)
     ks = np.arange(min(first, last), last + 1)
-    distances, _ = cKDTree(x).query(x, k=ks + 1)
-    volumes = np.mean(4 / 3 * np.pi * distances.reshape(len(x), -1) ** 3 / ks[None, :], axis=1)
+    distances, _ = KDTree(x).query(x, k=last + 1)  # the first is the point itself
+    volumes = np.mean(4 / 3 * np.pi * distances[:, ks] ** 3 / ks[None, :], axis=1)
     positive = volumes[volumes > 0]
     if len(positive) == 0:
         raise ValueError("Argument `x` must hold different points, but all of them coincide.")

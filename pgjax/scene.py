@@ -193,7 +193,7 @@ def initial_state(
     H = jnp.zeros((n, 3, 3), dtype)
     if F is not None:
         F = _array("F", F, (n, 3, 3))
-        H = F - np.broadcast_to(np.eye(3, dtype=F.dtype), F.shape)
+        H = jnp.asarray(F - np.broadcast_to(np.eye(3, dtype=F.dtype), F.shape), dtype)
     for name, value in (("v", v), ("C", C), ("F", H)):
         require_entries(name, value, "be finite", np.isfinite)
     history = tuple(

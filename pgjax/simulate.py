@@ -94,11 +94,12 @@ def simulate(
     for name, value in (("frames", frames), ("substeps", substeps)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"Argument `{name}` must be a whole number ≥ 1, but is {value!r}.")
+    frames, substeps = int(frames), int(substeps)
     _check_particles(scene, state)
     _check_dt(scene, dt, allow_unstable)
     report = _meter(frames) if progress is True else progress or None
     trajectory = _rollout(
-        scene, state, jnp.asarray(dt, state.dtype), int(frames), int(substeps), save, report
+        scene, state, jnp.asarray(dt, state.dtype), frames, substeps, save, report
     )
     if throw:
         trajectory.status.check()

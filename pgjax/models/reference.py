@@ -7,6 +7,7 @@ neo-Hookean laws have no such form, since theirs needs no decomposition.
 """
 
 import abc
+import functools
 from typing import Any, final
 
 import jax
@@ -143,8 +144,7 @@ class AbstractPrincipalPlasticity(AbstractPlasticity):
         F = identity(H) + H
         _, yields, new = self.principal(_singular_values(F), history, elasticity, dt)
         upright = det(F) > 0
-        if history is not None:
-            new = jnp.where(upright, new, history)
+        new = jax.tree.map(functools.partial(jnp.where, upright), new, history)
         return jnp.where(yields & upright, isotropic(Z, F) - identity(H), H), new
 
     def goes_with(self, elasticity: AbstractElasticity) -> bool:

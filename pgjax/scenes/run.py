@@ -3,7 +3,7 @@
 import json
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -56,29 +56,22 @@ def run(
     (folder / "ply" if ply_frames else folder).mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     video = folder / "video.mp4"
-    state, ahead, bounded = plan.state, _advance(plan, plan.state), 0
+    state, frame, bounded, image = plan.state, 0, 0, np.zeros((0, 0, 3))
     with VideoWriter(video, fps=plan.fps) as writer:
-        for frame in range(plan.frames + 1):
-            if frame > 0:
-                state = ahead.final
-                # The next frame is simulated while this one is drawn.
-                if frame < plan.frames and bool(state.status.ok):
-                    ahead = _advance(plan, state)
+        for frame, state in enumerate(_states(plan)):
             gaussians, count = carried(plan, state.x, state.F)
             bounded = max(bounded, count)
             image = _draw(plan, gaussians, frame)
             writer.add(image)
             if frame == 0:
                 save_image(folder / "first.png", image)
+            elif progress is not None:
+                progress(frame, plan.frames)
             if ply_frames:
                 save_ply(
                     folder / "ply" / f"{frame:05d}.ply",
                     gaussians.transformed(plan.to_simulation.inverse()),
                 )
-            if progress is not None and frame > 0:
-                progress(frame, plan.frames)
-            if not bool(state.status.ok):
-                break
     save_image(folder / "last.png", image)
     seconds = time.perf_counter() - started
     record = _record(plan, state, frame, seconds) | {"most_bounded_gaussians": bounded}
@@ -100,6 +93,21 @@ def require_empty(folder: Path) -> None:
             f"Argument `out` must be a new or an empty folder, so that nothing is overwritten, "
             f"but {folder} is not."
         )
+
+
+def _states(plan: Plan) -> Iterator[State]:
+    """The initial state and that after each frame, as far as nothing goes wrong.
+
+    The next frame is already being simulated while the caller draws this one.
+    """
+    state = plan.state
+    for _ in range(plan.frames):
+        ahead = _advance(plan, state)
+        yield state
+        state = ahead.final
+        if not bool(state.status.ok):
+            break
+    yield state
 
 
 def _advance(plan: Plan, state: State) -> Trajectory:

@@ -277,13 +277,13 @@ def _contact(t: Table) -> AbstractContact:
     )
     friction = t.number("friction", None, at_least=0)
     if kind is Separating:
-        return Separating(0.0 if friction is None else friction)
+        return Separating() if friction is None else Separating(friction)
     if friction is not None:
         raise t.error("friction", "be left out unless `contact` is separating")
     return kind()
 
 
-def _window(t: Table) -> dict[str, float]:
+def _window(t: Table) -> dict[str, Any]:
     return {"start": t.number("start", 0.0), "end": t.number("end", math.inf)}
 
 
