@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from pgjax._safe import safe_divide
-from pgjax._types import Array, Matrix3, Scalar, Vector3
+from pgjax._types import Array, Bool, Matrix3, Scalar, Vector3
 
 # Cyclic Jacobi converges quadratically: errors after these are at rounding level.
 _SWEEPS = {"float32": 4, "float64": 6}
@@ -114,9 +114,8 @@ def _dot(a: list[Scalar], b: list[Scalar]) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _order_columns(g: list, v: list) -> None:
-    """Sort the columns of `g` by length, largest first, turning `v` with them (det V kept)."""
-    square = [_dot(column, column) for column in g]
+def _order_columns(square: list, g: list, v: list) -> None:
+    """Sort the columns of `g` by squared length, largest first, turning `v` along (det V kept)."""
     for i, j in ((0, 1), (0, 2), (1, 2)):
         swap = square[i] < square[j]
         square[i], square[j] = (
@@ -131,24 +130,29 @@ def _order_columns(g: list, v: list) -> None:
             )
 
 
-def _unit_or(a: Vector3, smallest: Scalar, fallback: Vector3) -> Vector3:
-    """`a/|a|`, or `fallback` where `|a|` is at most `smallest`."""
-    length = jnp.sqrt(jnp.sum(a * a))
-    good = length > smallest
-    return jnp.where(good, a / jnp.where(good, length, 1), fallback)
+def _unit_or(a: Vector3, good: Bool[Array, ""], fallback: Vector3) -> Vector3:
+    """`a/|a|`, or `fallback` where that is not `good`."""
+    return jnp.where(good, a / jnp.sqrt(jnp.sum(jnp.where(good, a * a, 1))), fallback)
 
 
 def _perpendicular(u: Vector3) -> Vector3:
-    """A unit vector perpendicular to the unit vector `u`."""
-    least = jnp.argmin(jnp.abs(u))
-    axis = jnp.zeros(3, u.dtype).at[least].set(1)
-    c = jnp.cross(u, axis)
-    return c / jnp.sqrt(jnp.sum(c * c))
+    """A unit vector perpendicular to the unit vector `u` (Duff et al. 2017)."""
+    x, y, z = u
+    sign = jnp.where(z < 0, -1, 1).astype(u.dtype)
+    a = -1 / (sign + z)
+    return jnp.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x])
 
 
-def _hestenes_sweep(_: Array, columns: tuple[Matrix3, Matrix3]) -> tuple[Matrix3, Matrix3]:
-    """Turn each pair of columns of `G = F V` (stored as rows) until they are perpendicular."""
-    g, v = ([[m[j, i] for i in range(3)] for j in range(3)] for m in columns)
+def _hestenes_sweep(
+    _: Array, carry: tuple[Matrix3, Matrix3, Vector3]
+) -> tuple[Matrix3, Matrix3, Vector3]:
+    """Turn each pair of columns of `G = F V` (stored as rows) until they are perpendicular.
+
+    Returns G, V and the squared lengths of the columns. The lengths belong to the carry because
+    what leaves a loop is stored: computed later, XLA repeats them in every kernel that compares
+    two of them, rounded differently, and equal columns are exchanged in G but not in V.
+    """
+    g, v = ([[m[j, i] for i in range(3)] for j in range(3)] for m in carry[:2])
     for i, j, _k in _PAIRS:
         dot = _dot(g[i], g[j])
         gap = _dot(g[j], g[j]) - _dot(g[i], g[i])
@@ -159,7 +163,7 @@ def _hestenes_sweep(_: Array, columns: tuple[Matrix3, Matrix3]) -> tuple[Matrix3
                 [s * x + c * y for x, y in zip(m[i], m[j], strict=True)],
             )
     G, V = (jnp.stack([jnp.stack(column) for column in m]) for m in (g, v))
-    return G, V
+    return G, V, jnp.stack([_dot(column, column) for column in g])
 
 
 def svd(F: Matrix3) -> tuple[Matrix3, Vector3, Matrix3]:
@@ -178,17 +182,16 @@ def svd(F: Matrix3) -> tuple[Matrix3, Vector3, Matrix3]:
     scale = jnp.where(scale > 0, scale, 1)
     A = F / scale
     # A loop, not unrolled: unrolled, XLA's fusion recomputes earlier sweeps many times over.
-    columns = jax.lax.fori_loop(
-        0, _sweeps(F.dtype) + 1, _hestenes_sweep, (A.T, jnp.eye(3, dtype=F.dtype))
-    )
-    g, v = ([[m[j, i] for i in range(3)] for j in range(3)] for m in columns)
-    _order_columns(g, v)
+    start = (A.T, jnp.eye(3, dtype=F.dtype), jnp.zeros(3, F.dtype))
+    G, V, lengths = jax.lax.fori_loop(0, _sweeps(F.dtype) + 1, _hestenes_sweep, start)
+    g, v = ([[m[j, i] for i in range(3)] for j in range(3)] for m in (G, V))
+    square = list(lengths)
+    _order_columns(square, g, v)
     g1, g2, g3 = (jnp.stack(column) for column in g)
-    tiny = jnp.asarray(jnp.finfo(F.dtype).tiny, F.dtype)
-    eps = jnp.asarray(jnp.finfo(F.dtype).eps, F.dtype)
-    u1 = _unit_or(g1, tiny, jnp.zeros(3, F.dtype).at[0].set(1))
+    eps = float(jnp.finfo(F.dtype).eps)
+    u1 = _unit_or(g1, square[0] > 0, jnp.zeros(3, F.dtype).at[0].set(1))
     rest = g2 - jnp.sum(u1 * g2) * u1
-    u2 = _unit_or(rest, eps * jnp.sqrt(jnp.sum(g1 * g1)), _perpendicular(u1))
+    u2 = _unit_or(rest, square[1] > eps * eps * square[0], _perpendicular(u1))
     u2 = u2 - jnp.sum(u1 * u2) * u1
     u2 = u2 / jnp.sqrt(jnp.sum(u2 * u2))
     u3 = jnp.cross(u1, u2)
@@ -211,8 +214,10 @@ def _isotropic_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     U, V, jacobian, m, q = frozen
     A = U.T @ dF @ V
     diagonal = jacobian @ jnp.diagonal(A) + dvalues
-    off = ((m + q) * A + (m - q) * A.T) / 2
-    inner = off - jnp.diag(jnp.diagonal(off)) + jnp.diag(diagonal)
+    # Sum and difference first: q is huge where σ_i + σ_j nearly vanishes, as on its diagonal for
+    # a singular F, which is therefore selected, not subtracted.
+    off = (m * (A + A.T) + q * (A - A.T)) / 2
+    inner = jnp.where(jnp.eye(3, dtype=bool), jnp.diag(diagonal), off)
     return _isotropic(F, values, frozen), U @ inner @ V.T
 
 

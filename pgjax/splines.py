@@ -53,12 +53,12 @@ class BSpline(eqx.Module):
         if self.degree == 2:
             a, b, c = 1.5 - offset, offset - 1, offset - 0.5
             return jnp.stack([a * a / 2, 0.75 - b * b, c * c / 2]), jnp.stack([-a, -2 * b, c])
+        # s³/6 and t³/6 cancel in the sums, so that Σ w = s + t = 1 and Σ dw = 0 carry no bias
+        # from rounding; written as polynomials they drift in float32 over many steps.
         t = offset - 1
         s = 1 - t
-        w = jnp.stack(
-            [s**3 / 6, 2 / 3 - t * t + t**3 / 2, 2 / 3 - s * s + s**3 / 2, t**3 / 6],
-        )
-        dw = jnp.stack(
-            [-s * s / 2, -2 * t + 1.5 * t * t, 2 * s - 1.5 * s * s, t * t / 2],
-        )
+        a, b = s * s * s / 6, t * t * t / 6
+        da, db = -s * s / 2, t * t / 2
+        w = jnp.stack([a, s - (2 * a - b), t - (2 * b - a), b])
+        dw = jnp.stack([da, -1 - (2 * da - db), 1 - (2 * db - da), db])
         return w, dw

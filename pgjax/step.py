@@ -160,7 +160,9 @@ def _grid_to_particles(
 ) -> tuple[Float[Array, "p d"], Float[Array, "p d d"], Float[Array, "p d d"]]:
     """`v = Σ w v_i`, `C = Σ w v_i (x_i − x_p)ᵀ/D` and the gradient L that deforms (eq. 3)."""
     v, moment, slope = gather(scene.grid, at, grid_v)
-    C = moment / scene.D
+    # Divided by h twice: the rounding of h² would bias C, and with it L, at every step. The
+    # barrier keeps the compiler from merging the divisions.
+    C = jax.lax.optimization_barrier(moment / scene.spline.moment / scene.grid.h) / scene.grid.h
     L = scene.scheme.velocity_gradient(C, slope)
     return v, C, L
 

@@ -73,15 +73,25 @@ def principal_stretches(H: Matrix3) -> tuple[Vector3, Vector3, Matrix3]:
     return sigma, w, Q
 
 
-def _log_divided(w: Vector3, smallest: Scalar) -> Matrix3:
-    """Divided differences of `log(1 + w)`, constant below `1 + w = smallest`."""
-    clamped = jnp.maximum(w, smallest - 1)
-    a, b = clamped[:, None], clamped[None, :]
-    ratio = (a - b) / (1 + b)
-    gap = w[:, None] - w[None, :]
-    inside = (w > smallest - 1).astype(w.dtype)
-    tangent = (inside / (1 + clamped))[:, None] * jnp.ones_like(gap)
-    return jnp.where(gap == 0, tangent, jnp.log1p(ratio) / jnp.where(gap == 0, 1, gap))
+def _log_divided(sigma: Vector3, w: Vector3) -> Matrix3:
+    """Divided differences of `log σ²` over `w = σ² − 1`, with σ continued as in `hencky_strain`."""
+    square = jnp.maximum(sigma, SMALLEST_STRETCH) ** 2
+    inside = sigma > SMALLEST_STRETCH
+    # w is accurate near 0, σ² far below: their differences are taken from the better one.
+    both_small = (w[:, None] < -0.5) & (w[None, :] < -0.5)
+    kept = jnp.where(inside, w, square - 1)
+    change = jnp.where(both_small, _difference(square), _difference(kept))
+    gap = jnp.where(both_small, _difference(jnp.where(inside, square, 0)), _difference(w))
+    tangent = jnp.where(inside, 1 / square, 0)[:, None] * jnp.ones_like(gap)
+    ratio = change / square[None, :]
+    near = jnp.abs(ratio) < 0.5
+    logarithm = jnp.log1p(jnp.where(near, ratio, 0))
+    logarithm = jnp.where(near, logarithm, _difference(jnp.log(square)))
+    return jnp.where(gap == 0, tangent, logarithm / jnp.where(gap == 0, 1, gap))
+
+
+def _difference(a: Vector3) -> Matrix3:
+    return a[:, None] - a[None, :]
 
 
 def hencky_strain(H: Matrix3) -> tuple[Matrix3, Matrix3]:
@@ -93,11 +103,12 @@ def hencky_strain(H: Matrix3) -> tuple[Matrix3, Matrix3]:
         `eps (3, 3)` and `Q (3, 3)`, the directions both `eps` and `F Fᵀ` share.
     """
     sigma, w, Q = principal_stretches(H)
-    smallest = jnp.asarray(SMALLEST_STRETCH**2, H.dtype)
     # An inverted direction counts as fully compressed, not by its squared stretch.
-    w = jnp.where(sigma < SMALLEST_STRETCH, jnp.minimum(w, -1), w)
-    values = jnp.log1p(jnp.maximum(w, smallest - 1)) / 2
-    return spectral_map(left_strain(H), Q, values, _log_divided(w, smallest) / 2), Q
+    w = jnp.where(sigma < SMALLEST_STRETCH, -1, w)
+    # Near 1 from w, which is exact there; far below from σ: 1e-8 − 1 is −1 in float32.
+    near = jnp.log1p(jnp.maximum(w, -0.5)) / 2
+    values = jnp.where(w > -0.5, near, jnp.log(jnp.maximum(sigma, SMALLEST_STRETCH)))
+    return spectral_map(left_strain(H), Q, values, _log_divided(sigma, w) / 2), Q
 
 
 def stretch_minus_identity(H: Matrix3) -> Matrix3:

@@ -23,6 +23,7 @@ from pgjax.models.elasticity import (
     identity,
     isochoric_strain,
     principal_stretches,
+    volume_change,
 )
 
 _ROOT_2_3 = (2 / 3) ** 0.5
@@ -55,7 +56,10 @@ def _expm1_map(delta: Matrix3, Q: Matrix3) -> Matrix3:
 
 
 class AbstractHenckyPlasticity(AbstractPlasticity):
-    """A return mapping in Hencky strain: a new one implements `flow` only."""
+    """A return mapping in Hencky strain: a new one implements `flow` only.
+
+    An inverted particle (det F ≤ 0) does not flow: its stress has to push it back first.
+    """
 
     @abc.abstractmethod
     def flow(
@@ -70,7 +74,11 @@ class AbstractHenckyPlasticity(AbstractPlasticity):
         """`Fe ← exp(ε − ε_trial) Fe_trial`."""
         del dt
         trial, Q = hencky_strain(H)
-        eps, yields, history = self.flow(trial, history, elasticity)
+        eps, yields, new = self.flow(trial, history, elasticity)
+        upright = volume_change(H) > -1
+        yields = yields & upright
+        if history is not None:
+            history = jnp.where(upright, new, history)
         M = _expm1_map(jnp.where(yields, eps - trial, 0), Q)
         return jnp.where(yields, H + M + M @ H, H), history
 
@@ -112,8 +120,9 @@ class VonMises(AbstractHenckyPlasticity):
             tau_Y = tau_Y + 2 * elasticity.mu * self.hardening * history
         shear = deviator(eps)
         norm = frobenius(shear)
-        dgamma = norm - tau_Y / (2 * elasticity.mu)
-        yields = dgamma > 0
+        yields = norm > tau_Y / (2 * elasticity.mu)
+        # The argument is guarded, not the result: an infinite τ_Y must not reach a derivative.
+        dgamma = norm - jnp.where(yields, tau_Y, 0) / (2 * elasticity.mu)
         dgamma = jnp.where(yields, dgamma, 0)
         new = eps - dgamma * safe_divide(shear, norm * jnp.ones_like(shear))
         return new, yields, None if history is None else history + dgamma
@@ -231,15 +240,14 @@ class HerschelBulkley(AbstractPlasticity):
         """The norm s after the step from the trial norm, Pa (s_trial above s_Y)."""
         s_Y = _ROOT_2_3 * self.yield_stress
         excess = jnp.maximum(s_trial - s_Y, 0)
+        rigid = jnp.isinf(self.viscosity)
+        eta = jnp.where(rigid, 1, self.viscosity)
         if self.h is None:
-            # (s_tr − s_Y) η/(η + 2 μ Δt): the printed form, finite for any η.
-            fraction = jnp.where(
-                jnp.isinf(self.viscosity),
-                1,
-                self.viscosity / (self.viscosity + 2 * mu * dt),
-            )
-            return s_Y + excess * fraction
-        return s_Y + _herschel_bulkley_excess(excess, self.viscosity, self.h, mu, dt)
+            # The printed form, s_tr − (s_tr − s_Y)/(1 + η/(2 μ Δt)), also for η = 0.
+            flowed = excess * eta / (eta + 2 * mu * dt)
+        else:
+            flowed = _herschel_bulkley_excess(excess, eta, self.h, mu, dt)
+        return s_Y + jnp.where(rigid, excess, flowed)
 
     def return_map(
         self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
@@ -250,7 +258,8 @@ class HerschelBulkley(AbstractPlasticity):
         trial = deviator(strain)
         norm = frobenius(trial)
         s_trial = mu * norm
-        yields = s_trial > _ROOT_2_3 * self.yield_stress
+        # An inverted particle does not flow: its stress has to push it back first.
+        yields = (s_trial > _ROOT_2_3 * self.yield_stress) & (volume_change(H) > -1)
         s = jnp.where(yields, self.flow_stress(s_trial, mu, dt), s_trial)
         S = (s / mu) * safe_divide(trial, norm * jnp.ones_like(trial))
         c = _unit_determinant(S)
