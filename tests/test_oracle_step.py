@@ -146,16 +146,17 @@ def run_both(name, d, degree, scheme):
     [(3, 2, SplineGradient()), (2, 3, SplineGradient()), (2, 2, MLS()), (3, 3, MLS())],
     ids=["3d-quadratic", "2d-cubic", "2d-quadratic-mls", "3d-cubic-mls"],
 )
-def test_step_matches_oracle(name, d, degree, scheme):
+def test_step_matches_oracle(measure, name, d, degree, scheme):
     if d == 3 and degree == 3 and name not in ("fixed corotated", "metal"):
         pytest.skip("the cubic step in three dimensions is compared for two materials only")
     state, expected = run_both(name, d, degree, scheme)
-    for ours, theirs in (
+    pairs = (
         (state.x, expected.x),
         (state.v, expected.v),
         (state.C, expected.C),
         (state.Fe, expected.Fe),
         (state.F, expected.F),
-    ):
-        error = np.max(np.abs(np.asarray(ours) - theirs)) / np.max(np.abs(theirs))
-        assert error < 1e-12
+    )
+    error = max(np.max(np.abs(np.asarray(a) - b)) / np.max(np.abs(b)) for a, b in pairs)
+    label = f"{name}, {d}-D, degree {degree}, {type(scheme).__name__}"
+    measure("V41", f"20 steps against the oracle: {label}", error, below=1e-12)

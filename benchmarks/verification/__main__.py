@@ -45,7 +45,8 @@ def main(arguments: list[str]) -> int:
     RESULTS.mkdir(exist_ok=True)
     measured = RESULTS / "verification_core.json"
     measured.unlink(missing_ok=True)
-    cases = ["tests/verification", "tests/test_timestep.py"]
+    others = ("timestep", "oracle_step", "linalg", "rollout")
+    cases = ["tests/verification", *(f"tests/test_{name}.py" for name in others)]
     options = ["-m", "", "--measured", str(measured), *arguments]
     code = subprocess.call([sys.executable, "-m", "pytest", *cases, *options], cwd=ROOT)
     if measured.exists():
