@@ -75,6 +75,7 @@ def kept(states):
     return jax.tree.map(lambda *a: jnp.stack(a), *[pgjax.Kinematics(s.x, s.v, s.F) for s in states])
 
 
+@pytest.mark.float64
 def test_jit_scan_and_loop_are_one(measure):
     """V44. Entry 0 of what is saved is the initial state; a restart changes no bit."""
     jelly, at_rest = one_body()
@@ -97,6 +98,7 @@ def test_jit_scan_and_loop_are_one(measure):
     np.testing.assert_array_equal(rest.t, whole.t[2:])
 
 
+@pytest.mark.float64
 def test_batch_of_scenes(measure):
     """V44: `vmap` over E equals separate runs, and a member that fails disturbs no other."""
 
@@ -256,6 +258,7 @@ def test_materials_far_apart_do_not_meet(measure):
         measure("H43", f"{law} beside another material = alone, 30 steps", gap, below=1e-13)
 
 
+@pytest.mark.float64
 def test_values_per_particle_are_slices(measure):
     """One material with a value per particle equals two materials."""
     x, v = particles(12)
@@ -276,6 +279,7 @@ def test_values_per_particle_are_slices(measure):
     measure("V44", "values per particle = slices, 30 steps", gap, below=1e-13)
 
 
+@pytest.mark.float64
 def test_periodic_direction(measure):
     """A body that crosses the seam moves as one that does not, and returns after one period."""
     grid = pgjax.Grid([0.0, 0.0], (8, 12), H, periodic=(True, False))
@@ -293,6 +297,7 @@ def test_periodic_direction(measure):
     measure("V44", "across the periodic seam = inside, 40 steps", gap, below=1e-12)
 
 
+@pytest.mark.float64
 def test_plane_strain_is_a_slab(measure):
     """d = 2 equals d = 3 one cell wide and periodic, plastic flow included."""
     x, v = particles(10)
@@ -319,6 +324,7 @@ def test_plane_strain_is_a_slab(measure):
     measure("V21", "d = 2 against a periodic slab, 50 steps", gap, below=1e-10)
 
 
+@pytest.mark.float64
 def test_particle_velocity_is_followed_exactly(measure):
     """Held particles move with the value while the window lasts, whatever pulls at them."""
     held = np.arange(9) < 4
@@ -335,6 +341,7 @@ def test_particle_velocity_is_followed_exactly(measure):
     assert not np.allclose(after.v[held], value)
 
 
+@pytest.mark.float64
 def test_grid_velocity_moves_with_its_box():
     """Nodes in the box have the velocity in the window: the particles inside follow it."""
     velocity = np.array([0.5, 0.25])
@@ -350,6 +357,7 @@ def test_grid_velocity_moves_with_its_box():
     assert np.abs(np.asarray(after.v) - velocity).max() > 1e-6
 
 
+@pytest.mark.float64
 @pytest.mark.parametrize("duration", [0.0, 0.0125])
 def test_impulse_is_a_total_momentum(duration, measure):
     """It depends neither on the number of particles nor on the time step, nor how they meet."""
@@ -365,6 +373,7 @@ def test_impulse_is_a_total_momentum(duration, measure):
     measure("V44", f"total momentum of a push of {duration} s", max(gaps), below=1e-12)
 
 
+@pytest.mark.float64
 def test_damping_does_not_depend_on_the_time_step(measure):
     """`v ∝ exp(−γ t)` and the symmetric part of C ∝ exp(−r t), to rounding, for any dt."""
     gamma, r, duration = 3.0, 40.0, 0.02
@@ -384,6 +393,7 @@ def test_damping_does_not_depend_on_the_time_step(measure):
         measure("V44", f"shear damping, {steps} steps", difference(end.C, exact), below=1e-10)
 
 
+@pytest.mark.float64
 def test_body_force(measure):
     """`v = Σ Δt b(X0, t)` for particles that do not touch, each with its own X0."""
     x = np.array([[0.2, 0.3], [0.9, 0.8]])
