@@ -1,6 +1,6 @@
 """Time of 200 steps of 29 791 particles on a 64³ grid, per material and scheme, in pure JAX.
 
-    python -m benchmarks.speed_core
+    python -m benchmarks.speed_core [MATERIAL …]
 
 prints the table and writes `benchmarks/results/speed_core.json` and `.md`. Compilation is timed
 apart; the run is the median of three, after it, blocked until ready.
@@ -10,6 +10,7 @@ import json
 import os
 import platform
 import statistics
+import sys
 import time
 from pathlib import Path
 
@@ -79,13 +80,14 @@ def nothing(state):
 def main():
     """Measure every pair and write the table."""
     rows = []
-    for name, material in MATERIALS.items():
+    for name in sys.argv[1:] or MATERIALS:
+        material = MATERIALS[name]
         for label, scheme in SCHEMES.items():
             row = {"material": name, "scheme": label} | measure(material, scheme)
             rows.append(row)
             print(row, flush=True)
     about = {
-        "command": "python -m benchmarks.speed_core",
+        "command": " ".join(["python -m benchmarks.speed_core", *map(repr, sys.argv[1:])]),
         "particles": SIDE**3,
         "grid": [CELLS] * 3,
         "steps": STEPS,
