@@ -6,6 +6,7 @@ new elastic deformation is `Fe ← exp(Δε) Fe`, written on `H = Fe − I` as `
 """
 
 import abc
+import functools
 from typing import Any, final
 
 import equinox as eqx
@@ -77,8 +78,7 @@ class AbstractHenckyPlasticity(AbstractPlasticity):
         eps, yields, new = self.flow(trial, history, elasticity)
         upright = volume_change(H) > -1
         yields = yields & upright
-        if history is not None:
-            history = jnp.where(upright, new, history)
+        history = jax.tree.map(functools.partial(jnp.where, upright), new, history)
         M = _expm1_map(jnp.where(yields, eps - trial, 0), Q)
         return jnp.where(yields, H + M + M @ H, H), history
 
