@@ -66,12 +66,14 @@ def concrete(value: Any) -> np.ndarray | None:
 def require(name: str, value: Any, rule: str, holds: Any) -> None:
     """Raise a `ValueError` that names argument, rule and value unless `holds(value)` everywhere.
 
-    Values being traced are not checked: their errors appear in `Trajectory.status`.
+    Of an array the message gives the first bad entry, its index and how many there are. Values
+    being traced are not checked: their errors appear in `Trajectory.status`.
     """
     array = concrete(value)
     if array is None:
         return
-    ok = np.asarray(holds(array))
-    if not np.all(ok):
-        bad = array if array.ndim == 0 else array[tuple(np.argwhere(~ok)[0])] if ok.shape else array
-        raise ValueError(f"Argument `{name}` must {rule}, but is {bad!s}.")
+    bad = np.argwhere(~np.broadcast_to(holds(array), array.shape))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        where = f" at index {index} ({len(bad)} bad entries)" if index else ""
+        raise ValueError(f"Argument `{name}` must {rule}, but is {array[index]!s}{where}.")

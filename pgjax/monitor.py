@@ -17,6 +17,13 @@ CROWDED_CELL = 30_000
 LARGEST_STRETCH_RATIO = 1e5
 
 
+def note_start(scene: Scene, state: State, dt: Scalar) -> State:
+    """The same for the state before the first step; one that goes on has been looked at."""
+    noted = note_frame(scene, state, dt)
+    status = jax.tree.map(lambda a, b: jnp.where(state.step == 0, a, b), noted.status, state.status)
+    return eqx.tree_at(lambda s: s.status, state, status)
+
+
 def note_frame(scene: Scene, state: State, dt: Scalar) -> State:
     """Count DT_ABOVE_BOUND, ELLIPTICITY_LOST and, in single precision, F32_RESOLUTION."""
     scene = cast(scene, state.dtype)

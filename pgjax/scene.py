@@ -90,7 +90,7 @@ class Scene(eqx.Module):
         _check_shape("volumes", self.volumes, (n,))
         if n == 0:
             raise ValueError("Argument `volumes` must hold at least one particle, but is empty.")
-        require_entries("volumes", self.volumes, "be positive and finite", _positive)
+        require("volumes", self.volumes, "be positive and finite", _positive)
         if len(self.counts) != len(self.materials) or sum(self.counts) != n:
             raise ValueError(
                 f"Argument `counts` must give the particles of each of {len(self.materials)} "
@@ -143,20 +143,34 @@ class Scene(eqx.Module):
 
     def rest_sound_speed(self) -> Scalar:
         """`c = √(max(dλ + 2μ, 2μ)/ρ)` of the stiffest material at rest, m/s."""
-        speeds = []
-        for material in self.materials:
-            law = material.elasticity
-            modulus = jnp.maximum(self.grid.dimension * law.lam + 2 * law.mu, 2 * law.mu)
-            speeds.append(jnp.max(jnp.sqrt(modulus / material.density)))
+        d = self.grid.dimension
+        speeds = [jnp.max(jnp.sqrt(m.rest_modulus(d) / m.density)) for m in self.materials]
         return jnp.max(jnp.stack(speeds))
 
-    def elastic_limit(self, sound_speed: Scalar) -> Scalar:
-        """The sharp bound `β(s) h/c` of the time step, s."""
+    def elastic_limit(
+        self, sound_speed: Float[Array, "..."], viscosity: Float[Array, "..."] | float = 0.0
+    ) -> Float[Array, "..."]:
+        """The sharp bound of the time step, s: `β(s) h/c` without viscosity.
+
+        A kinematic viscosity ν = η/ρ alone allows `D/ν`; together the step has to satisfy
+        `(Δt c/(β h))² + Δt ν/D ≤ 1`, exact for an isolated particle.
+        """
         undamped = self.scheme.stable_courant(self.spline) * self.grid.h / sound_speed
         damped = self.scheme.stable_courant(self.spline, 0.0) * self.grid.h / sound_speed
         # RPIC keeps at least this part of the symmetric C in any step below the bound.
         kept = jnp.exp(-self.shear_damping * undamped)
-        return damped + (undamped - damped) * jnp.where(jnp.isnan(kept), 0, kept)
+        elastic = damped + (undamped - damped) * jnp.where(jnp.isnan(kept), 0, kept)
+        ratio = elastic * viscosity / self.D
+        return 2 * elastic / (ratio + jnp.sqrt(ratio * ratio + 4))
+
+    def rest_limit(self) -> Scalar:
+        """The sharp bound of the time step at rest, s: the smallest of all particles."""
+        d, limits = self.grid.dimension, []
+        for m in self.materials:
+            viscosity = m.elasticity.shear_viscosity().astype(m.density.dtype) / m.density
+            c = jnp.sqrt(m.rest_modulus(d) / m.density)
+            limits.append(jnp.min(self.elastic_limit(c, viscosity)))
+        return jnp.min(jnp.stack(limits))
 
 
 def initial_state(
@@ -184,7 +198,7 @@ def initial_state(
     dtype = _precision(dtype)
     n, d = scene.particle_count, scene.grid.dimension
     x = _array("x", x, (n, d))
-    require_entries("x", x, "be finite", np.isfinite)
+    require("x", x, "be finite", np.isfinite)
     # In the precision of the input, before anything is rounded to the simulation's.
     position = _relative(x, scene.grid.origin)
     _check_inside(scene, position)
@@ -195,7 +209,7 @@ def initial_state(
         F = _array("F", F, (n, 3, 3))
         H = jnp.asarray(F - np.broadcast_to(np.eye(3, dtype=F.dtype), F.shape), dtype)
     for name, value in (("v", v), ("C", C), ("F", H)):
-        require_entries(name, value, "be finite", np.isfinite)
+        require(name, value, "be finite", np.isfinite)
     history = tuple(
         None if (start := m.initial_history()) is None else jnp.full((c,), start, dtype)
         for m, c in zip(scene.materials, scene.counts, strict=True)
@@ -254,20 +268,6 @@ def _array(name: str, value: Any, *shapes: tuple[int, ...]) -> Array | np.ndarra
 def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
     if value.shape != shape:
         raise ValueError(f"Argument `{name}` must have shape {shape}, but has shape {value.shape}.")
-
-
-def require_entries(name: str, value: Any, rule: str, holds: Callable) -> None:
-    """Like `require`, for arrays: the message names the first bad index and how many there are."""
-    array = concrete(value)
-    if array is None:
-        return
-    bad = np.argwhere(~holds(array))
-    if len(bad):
-        index = tuple(int(i) for i in bad[0])
-        raise ValueError(
-            f"Argument `{name}` must {rule}, but is {array[index]!s} at index {index} "
-            f"({len(bad)} bad entries)."
-        )
 
 
 def _check_inside(scene: Scene, position: Array) -> None:

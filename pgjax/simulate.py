@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pgjax._types import Array, Float, Scalar, concrete
-from pgjax.monitor import note_frame
+from pgjax.monitor import note_frame, note_start
 from pgjax.result import SimulationWarning, Status
 from pgjax.scene import Scene
 from pgjax.state import State
@@ -122,7 +122,7 @@ def _check_dt(scene: Scene, dt: float | Array, allow_unstable: bool) -> None:
         return
     if value.ndim or not (np.isfinite(value) and value > 0):
         raise ValueError(f"Argument `dt` must be positive and finite (s), but is {dt}.")
-    limit = concrete(scene.elastic_limit(scene.rest_sound_speed()))
+    limit = concrete(scene.rest_limit())
     if limit is None or limit.ndim:
         return
     ratio, suggestion = float(value) / float(limit), 0.5 * float(limit)
@@ -153,17 +153,23 @@ def _rollout(
 ) -> Trajectory:
     """The nested scans. Frames are grouped, or divided, so that a block has about √T steps."""
     root = math.sqrt(frames * substeps)
+    block = math.ceil(root)
 
     def frame(state: State, index: Array) -> tuple[State, Any]:
         advance = jax.checkpoint(lambda s: step(scene, s, dt))
-        state = repeated(advance, state, substeps, block=math.ceil(root))
+        state = repeated(advance, state, substeps, block=block)
         state = note_frame(scene, state, dt)
         if report is not None:
             jax.debug.callback(functools.partial(_call, report), index, frames)
-        return state, save(state)
+        return state, jax.checkpoint(save)(state)
 
+    state = note_start(scene, state, dt)
     first = save(state)
-    final, rest = checkpointed_scan(frame, state, frames, group=max(1, round(root / substeps)))
+    if substeps > block:
+        # The blocks of steps inside a frame bound its memory already.
+        final, rest = jax.lax.scan(frame, state, jnp.arange(frames, dtype=jnp.int32))
+    else:
+        final, rest = checkpointed_scan(frame, state, frames, group=max(1, round(root / substeps)))
     saved = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, rest)
     t = (state.step + substeps * jnp.arange(frames + 1, dtype=jnp.int32)).astype(dt.dtype) * dt
     return Trajectory(saved, t, final, final.status)

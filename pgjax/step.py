@@ -36,7 +36,7 @@ def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
     t = state.step.astype(state.dtype) * dt
 
     held, state = _impose(scene, state, t, dt)
-    state, at, tau = _stress(scene, state)
+    state, at, tau = _stress(scene, state, t)
     grid_mass, grid_v = _particles_to_grid(scene, state, at, tau, dt)
     grid_v = _forces_and_boundaries(scene, grid_mass, grid_v, t, dt)
     v, C, L = _grid_to_particles(scene, at, grid_v)
@@ -60,7 +60,7 @@ def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Arr
     return held, eqx.tree_at(lambda s: (s.v, s.C), state, (v, C))
 
 
-def _stress(scene: Scene, state: State) -> tuple[State, Stencil, Float[Array, "p 3 3"]]:
+def _stress(scene: Scene, state: State, t: Scalar) -> tuple[State, Stencil, Float[Array, "p 3 3"]]:
     """Kirchhoff stress of every particle; those that cannot go on are masked here."""
     finite = _finite(state.position) & _finite(state.v) & _finite(state.C) & _finite(state.He)
     if state.H is not None:
@@ -71,17 +71,18 @@ def _stress(scene: Scene, state: State) -> tuple[State, Stencil, Float[Array, "p
     at, inside = stencil(scene.grid, scene.spline, _where(sound, state.position, 0))
     sound = sound & inside
     He, C = _where(sound, state.He, 0), _where(sound, state.C, 0)
+    total = He if state.H is None else _where(sound, state.H, 0)
 
     tau, inverted, clamped = [], [], []
     for material, part, history in zip(scene.materials, scene.slices, state.history, strict=True):
 
-        def law(material, H, L, history):
-            elasticity = material.elasticity
-            stress = elasticity.kirchhoff(H, L, history)
-            return stress, volume_change(H) <= -1, elasticity.clamped(H)
+        def law(material, H, total, L, history):
+            stress = material.kirchhoff(H, total, L, history, t)
+            return stress, volume_change(H) <= -1, material.elasticity.clamped(H, history)
 
-        axes = (particle_axes(material, part.stop - part.start), 0, 0, 0)
-        results = jax.vmap(law, in_axes=axes)(material, He[part], _embed(C[part]), history)
+        axes = (particle_axes(material, part.stop - part.start), 0, 0, 0, 0)
+        one = jax.vmap(law, in_axes=axes)
+        results = one(material, He[part], total[part], _embed(C[part]), history)
         for values, result in zip((tau, inverted, clamped), results, strict=True):
             values.append(result)
     tau, inverted, clamped = (jnp.concatenate(parts) for parts in (tau, inverted, clamped))

@@ -9,6 +9,7 @@ import numpy as np
 
 from pgjax._types import Array, Bool, Float, Scalar, concrete, require
 from pgjax.models.material import cast, particle_axes
+from pgjax.models.viscous import positive_volume
 from pgjax.scene import Scene
 from pgjax.state import State
 
@@ -18,7 +19,7 @@ ELASTIC_FRACTION, ADVECTIVE_FRACTION, DEFORMATION_FRACTION = 0.5, 0.25, 0.2
 
 
 class Limits(NamedTuple):
-    """Sharp limits of the time step for each particle, s, `(p,)`."""
+    """Sharp limits of the time step for each particle, s, `(p,)`; `elastic` with viscosity."""
 
     elastic: Float[Array, "*p"]
     advective: Float[Array, "*p"]
@@ -28,21 +29,28 @@ class Limits(NamedTuple):
 def limits(scene: Scene, state: State) -> Limits:
     """The limits for the deformation and the speed a state has.
 
-    Elastic: `β h/c` with c from a bound of the law's tangent at F. Advective: one cell a step at
+    Elastic: `β h/c` with c from a bound of the law's tangent at F, lowered by viscosity η J as
+    `Scene.elastic_limit` says. Advective: one cell a step at
     `|v| + 1.5 √d h ‖C‖`. Deformation: `1/‖C‖`, which keeps `det(I + Δt L) > 0`.
     """
     scene = cast(scene, state.dtype)
     d, h = scene.grid.dimension, scene.grid.h
-    modulus = []
-    for material, part in zip(scene.materials, scene.slices, strict=True):
+    total = state.He if state.H is None else state.H
+    speeds, viscosities = [], []
+    for material, part, history in zip(scene.materials, scene.slices, state.history, strict=True):
 
-        def bound(material, H):
-            return material.elasticity.tangent_bound(H, d) / material.density
+        def bound(material, H, total, history):
+            modulus = material.tangent_bound(H, total, d, history) / material.density
+            eta = material.elasticity.shear_viscosity().astype(H.dtype) * positive_volume(H)
+            return jnp.sqrt(modulus), eta / material.density
 
-        axes = (particle_axes(material, part.stop - part.start), 0)
-        modulus.append(jax.vmap(bound, in_axes=axes)(material, state.He[part]))
-    sound_speed = jnp.sqrt(jnp.concatenate(modulus))
-    elastic = jax.vmap(scene.elastic_limit)(sound_speed)
+        axes = (particle_axes(material, part.stop - part.start), 0, 0, 0)
+        speed, viscosity = jax.vmap(bound, in_axes=axes)(
+            material, state.He[part], total[part], history
+        )
+        speeds.append(speed)
+        viscosities.append(viscosity)
+    elastic = scene.elastic_limit(jnp.concatenate(speeds), jnp.concatenate(viscosities))
     spin = jnp.sqrt(jnp.sum(state.C**2, axis=(1, 2)))
     speed = jnp.sqrt(jnp.sum(state.v**2, axis=1)) + 1.5 * d**0.5 * h * spin
     return Limits(elastic, h / speed, 1 / spin)
@@ -72,7 +80,9 @@ def stable_dt(
     """A stable time step, s.
 
     `min(fraction β h/c, ¼ h/(|v| + 1.5 √d h ‖C‖), 0.2/‖C‖)`; the sharp `β` depends on spline,
-    scheme and damping (1/√2 for the default). Viscosity of Herschel–Bulkley adds no limit.
+    scheme and damping (1/√2 for the default). Viscosity η of `KelvinVoigt` and `Fluid` lowers
+    the elastic limit Δt_e to the root of `(Δt/Δt_e)² + Δt η/(ρ D) = 1`, `D` = h²/4 (quadratic) or
+    h²/3 (cubic); that of Herschel–Bulkley adds no limit.
 
     Args:
         scene: the scene; its parameters must be known (not traced).
@@ -84,7 +94,7 @@ def stable_dt(
         ValueError: `fraction` or `frame` is out of range, or a parameter is being traced.
     """
     require("fraction", fraction, "be in (0, 1]", lambda a: (a > 0) & (a <= 1))
-    rest = concrete(scene.elastic_limit(scene.rest_sound_speed()))
+    rest = concrete(scene.rest_limit())
     if rest is None:
         raise ValueError(
             "Argument `scene` must have known parameters, but some are being traced (jit, grad or "

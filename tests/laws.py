@@ -81,7 +81,19 @@ def _laws() -> dict[str, Law]:
     }
 
 
+def _more() -> dict[str, Law]:
+    damped = pm.KelvinVoigt(pm.StVKHencky(E, NU), 0.4)
+    clay, snow = pm.VonMises(0.6, softening=0.1), pm.CriticalStretches(0.2, 0.1)
+    return {
+        "Fluid": Law(pm.Material(pm.Fluid(E, 0.4, 7.0)), rate_independent=False),
+        "Plasticine": Law(pm.Material(damped, clay), history=0.02, isochoric=True),
+        "Snow": Law(pm.Material(pm.Snow(E, NU, 3.0), snow), history=0.9),
+    }
+
+
 LAWS = _laws()
+# Beyond the laws of the source: viscous, or their flow changes more than Fe (`test_more_models`).
+MORE = _more()
 ELASTIC = [name for name, law in LAWS.items() if not law.plastic]
 PLASTIC = [name for name, law in LAWS.items() if law.plastic]
 

@@ -30,7 +30,8 @@ def concrete_subclasses(base):
 
 @pytest.mark.parametrize("base", [pm.AbstractElasticity, pm.AbstractPlasticity])
 def test_every_law_of_the_package_is_tested(base):
-    tested = {type(part) for law in LAWS.values() for part in vars(law.material).values()}
+    every = (LAWS | laws.MORE).values()
+    tested = {type(part) for law in every for part in vars(law.material).values()}
     assert set(concrete_subclasses(base)) <= tested
 
 
@@ -104,6 +105,20 @@ def test_volume_correction_remembers_what_the_tip_gave_away():
         change = np.log(volume(after)) + v - np.log(volume(H)) - 0.02
         assert abs(change).max() <= 1000 * ROUNDING
         assert abs(v - 0.02).max() > 0.1
+
+
+@double
+def test_volume_correction_has_a_derivative_where_nothing_was_gained_yet():
+    """ε + v/3 I inside the cone: dF/dv = F/3 at v = 0 exactly."""
+    material = LAWS["DruckerPrager-corrected"].material
+    H = -1e-3 * jnp.eye(3)[None]
+
+    def after(v):
+        return respond(material, H, v)[0]
+
+    at, slope = jax.jvp(after, (jnp.zeros(1),), (jnp.ones(1),))
+    assert bool(jnp.all(at == H))
+    np.testing.assert_allclose(slope, np.asarray(H + jnp.eye(3)[None]) / 3, rtol=1e-12, atol=1e-15)
 
 
 # --- Derivatives ---------------------------------------------------------------------------------

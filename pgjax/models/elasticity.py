@@ -5,15 +5,14 @@ neo-Hookean law needs even those. Working from H instead of F keeps the stress a
 rounding at every strain: from F, float32 loses digits as 1e-7/strain.
 """
 
-import abc
 from typing import final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from pgjax._types import Array, Matrix3, Scalar, Vector3, parameter, require
+from pgjax._types import Array, Matrix3, Scalar, Vector3, parameter
 from pgjax.linalg import cofactor, deviator, eigenbasis, spectral_map
+from pgjax.models.law import AbstractElasticity
 
 # Below these, logarithms are continued (module docstring of each law says how), so that a
 # crushed or inverted particle is pushed back instead of turning into NaN.
@@ -125,59 +124,6 @@ def stretch_minus_identity(H: Matrix3) -> Matrix3:
     return spectral_map(left_strain(H), Q, values, divided)
 
 
-class AbstractElasticity(eqx.Module):
-    """An elastic law of one particle. A new law implements `kirchhoff` (and `energy`)."""
-
-    E: eqx.AbstractVar[Array]
-    nu: eqx.AbstractVar[Array]
-
-    def __check_init__(self):
-        require("E", self.E, "be positive and finite (Pa)", lambda a: (a > 0) & (a < float("inf")))
-        require("nu", self.nu, "be above -1", lambda a: a > -1)
-        require("nu", self.nu, "be below 0.5", lambda a: a < 0.5)
-
-    @property
-    def mu(self) -> Array:
-        """Shear modulus `E/(2(1 + ν))`, Pa."""
-        return self.E / (2 * (1 + self.nu))
-
-    @property
-    def lam(self) -> Array:
-        """Lamé's first parameter `Eν/((1 + ν)(1 − 2ν))`, Pa."""
-        return self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
-
-    @property
-    def kappa(self) -> Array:
-        """Bulk modulus `E/(3(1 − 2ν))`, Pa."""
-        return self.E / (3 * (1 - 2 * self.nu))
-
-    @abc.abstractmethod
-    def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
-        """Kirchhoff stress `τ = J σ`, Pa, from the elastic `H = Fe − I` of one particle.
-
-        `L` is the affine velocity (1/s) for laws with viscosity, `history` what the material's
-        return map carries; a purely elastic law uses neither.
-        """
-
-    def clamped(self, H: Matrix3) -> Array:
-        """Whether the law had to continue itself beyond its domain at this H."""
-        del H
-        return jnp.zeros((), bool)
-
-    def elliptic(self, H: Matrix3) -> Array:
-        """Whether waves travel in every direction, so that the motion is well posed."""
-        del H
-        return jnp.ones((), bool)
-
-    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
-        """Upper bound of `ρ₀ c²`, Pa: the largest eigenvalue of the spatial tangent at H.
-
-        At rest this is `max(dλ + 2μ, 2μ)`. It decides the stable time step.
-        """
-        del H
-        return jnp.maximum(dimension * self.lam + 2 * self.mu, 2 * self.mu)
-
-
 @final
 class FixedCorotated(AbstractElasticity):
     """Fixed corotated elasticity (Stomakhin et al. 2012).
@@ -207,11 +153,12 @@ class FixedCorotated(AbstractElasticity):
         change = volume_change(H)
         return self.mu * jnp.sum(V * V) + self.lam / 2 * change * change
 
-    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+    def tangent_bound(self, H: Matrix3, dimension: int, history: Array | None = None) -> Scalar:
         """`2μ s² + max(λ (J² + (d − 1) J (2J − 1)), |λ J (J − 1)|)`, s the largest stretch, Pa.
 
         The second term is exact: its eigenvalues for expansion, for shear and for spin.
         """
+        del history
         sigma, _, _ = principal_stretches(H)
         J = 1 + volume_change(H)
         expansion = self.lam * (J * J + (dimension - 1) * J * (2 * J - 1))
@@ -252,8 +199,9 @@ class StVKHencky(AbstractElasticity):
         e = jnp.log(jnp.maximum(sigma, SMALLEST_STRETCH))
         return e, 2 * self.mu * e + self.lam * jnp.sum(e)
 
-    def clamped(self, H: Matrix3) -> Array:
+    def clamped(self, H: Matrix3, history: Array | None = None) -> Array:
         """Whether a principal stretch is below 1e-4."""
+        del history
         sigma, _, _ = principal_stretches(H)
         return sigma[2] < SMALLEST_STRETCH
 
@@ -262,8 +210,9 @@ class StVKHencky(AbstractElasticity):
         _, tau = self._principal(H)
         return jnp.max(tau) < 2 * self.mu + self.lam
 
-    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+    def tangent_bound(self, H: Matrix3, dimension: int, history: Array | None = None) -> Scalar:
         """`μ ℓ coth(ℓ/2) + dλ + max |τ_i|`, ℓ = 2 log(σ₁/σ₃), Pa."""
+        del history
         e, tau = self._principal(H)
         half = e[0] - e[2]
         # x coth x = 1 + x²/3 − …, exactly 1 at rest.
@@ -298,15 +247,17 @@ class NeoHookean(AbstractElasticity):
         log_J, _ = log_volume(H)
         return self.mu * (jnp.trace(left_strain(H)) / 2 - log_J) + self.lam / 2 * log_J**2
 
-    def clamped(self, H: Matrix3) -> Array:
+    def clamped(self, H: Matrix3, history: Array | None = None) -> Array:
         """Whether the volume ratio is below 1e-2."""
+        del history
         return volume_change(H) <= SMALLEST_VOLUME_RATIO - 1
 
-    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+    def tangent_bound(self, H: Matrix3, dimension: int, history: Array | None = None) -> Scalar:
         """`μ s² + max(c + dλ, |c|)`, `c = μ − λ log J`, with the largest stretch s, Pa.
 
         The second term is exact: `c + dλ`, `c` and `−c` belong to expansion, shear and spin.
         """
+        del history
         log_J, J = log_volume(H)
         sigma, _, _ = principal_stretches(H)
         # d(log J)/d(log J) is 1; the continuation below J = 1e-2 has slope J/0.01.
@@ -346,17 +297,19 @@ class DevVolNeoHookean(AbstractElasticity):
         bulk = self.kappa / 2 * (change * (2 + change) / 2 - log_J)
         return bulk + self.mu / 2 * jnp.trace(isochoric_strain(H))
 
-    def clamped(self, H: Matrix3) -> Array:
+    def clamped(self, H: Matrix3, history: Array | None = None) -> Array:
         """Whether the volume ratio is below 1e-2."""
+        del history
         return volume_change(H) <= SMALLEST_VOLUME_RATIO - 1
 
-    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+    def tangent_bound(self, H: Matrix3, dimension: int, history: Array | None = None) -> Scalar:
         """`μ (t + (√(2/3) + 2/√3) ‖dev b̄‖) + max(c + d k, |c|)`, Pa.
 
         With `t = tr(b̄)/3` the tangent is `L ↦ μ L b̄ − ⅔ μ (tr L dev b̄ + (dev b̄ : L) I)` plus
         `c Lᵀ + k tr L I`, `c = μ t − κ/2 (J² − 1)`, `k = κ J² − ⅔ μ t`; the last two are exact,
         the largest eigenvalue of b̄ is at most `t + √(2/3) ‖dev b̄‖`.
         """
+        del history
         J = 1 + volume_change(H)
         strain = isochoric_strain(H)
         t = 1 + jnp.trace(strain) / 3

@@ -85,18 +85,27 @@ class AbstractHenckyPlasticity(AbstractPlasticity):
 
 @final
 class VonMises(AbstractHenckyPlasticity):
-    """Von Mises plasticity with optional linear isotropic hardening; goes with `StVKHencky`.
+    """Von Mises plasticity, linear isotropic hardening or softening; goes with `StVKHencky`.
 
-    `δγ = ‖ε̂‖ − τ_Y/(2μ)`; if positive, `ε ← ε − δγ ε̂/‖ε̂‖` and `τ_Y ← τ_Y + 2μ ξ δγ`.
+    `δγ = ‖ε̂‖ − τ_Y/(2μ)`; if positive, `ε ← ε − δγ ε̂/‖ε̂‖`, and then `τ_Y ← τ_Y + 2μ ξ δγ`
+    (hardening) or `τ_Y ← max(τ_Y − 2μ ξ δγ, 0)` (softening: metal, or plasticine). A step
+    flows at the τ_Y it started with. Softening depends on the mesh: flow gathers in bands as
+    narrow as a cell.
 
     Args:
         yield_stress: τ_Y, Pa, in the convention `‖dev τ‖ = τ_Y` (Frobenius norm): uniaxial yield
             at `√(3/2) τ_Y`, shear at `τ_Y/√2`. Not comparable with Herschel–Bulkley's σ_Y.
-        hardening: ξ ≥ 0. With None the material neither hardens nor remembers.
+        hardening: ξ ≥ 0. With None the material does not harden.
+        softening: ξ ≥ 0. With None the material does not soften. Only one of the two.
     """
 
     yield_stress: Array = parameter()
     hardening: Array | None = eqx.field(
+        default=None,
+        converter=lambda a: None if a is None else as_float_array(a),
+        metadata={"parameter": True},
+    )
+    softening: Array | None = eqx.field(
         default=None,
         converter=lambda a: None if a is None else as_float_array(a),
         metadata={"parameter": True},
@@ -106,18 +115,35 @@ class VonMises(AbstractHenckyPlasticity):
         require("yield_stress", self.yield_stress, "be at least 0 Pa", lambda a: a >= 0)
         if self.hardening is not None:
             require("hardening", self.hardening, "be at least 0 and finite", _nonnegative)
+        if self.softening is not None:
+            require("softening", self.softening, "be at least 0 and finite", _nonnegative)
+            if self.hardening is not None:
+                raise ValueError(
+                    "Argument `softening` must be None where `hardening` is given, but is "
+                    f"{self.softening}: a material does one of the two."
+                )
 
     def initial_history(self) -> float | None:
         """The accumulated δγ, from which the current yield stress follows."""
-        return None if self.hardening is None else 0.0
+        return None if self.hardening is None and self.softening is None else 0.0
+
+    def current_yield_stress(self, history: Array | None, mu: Scalar) -> Array:
+        """`τ_Y + 2μ ξ Σδγ` or `max(τ_Y − 2μ ξ Σδγ, 0)`, Pa."""
+        tau_Y = self.yield_stress
+        if history is None:
+            return tau_Y
+        if self.hardening is not None:
+            return tau_Y + 2 * mu * self.hardening * history
+        if self.softening is not None:
+            left = tau_Y - 2 * mu * self.softening * history
+            return jnp.where(left > 0, left, 0)
+        return tau_Y
 
     def flow(
         self, eps: Matrix3, history: Array | None, elasticity: AbstractElasticity
     ) -> tuple[Matrix3, Array, Array | None]:
         """Radial return of the deviator."""
-        tau_Y = self.yield_stress
-        if self.hardening is not None and history is not None:
-            tau_Y = tau_Y + 2 * elasticity.mu * self.hardening * history
+        tau_Y = self.current_yield_stress(history, elasticity.mu)
         shear = deviator(eps)
         norm = frobenius(shear)
         yields = norm > tau_Y / (2 * elasticity.mu)
@@ -174,26 +200,24 @@ class DruckerPrager(AbstractHenckyPlasticity):
     ) -> tuple[Matrix3, Array, Array | None]:
         """Return to the cone along the deviator, or to its tip."""
         I = identity(eps)
-        shift = jnp.zeros((), eps.dtype)
-        if self.cohesion is not None:
-            shift = shift - self.cohesion
-        if history is not None:
-            shift = shift + history / 3
-        moved = eps + shift * I
+        zero = jnp.zeros((), eps.dtype)
+        apex = zero if self.cohesion is None else self.cohesion
+        gained = zero if history is None else history
+        moved = eps + (gained / 3 - apex) * I
         shear, trace = deviator(moved), jnp.trace(moved)
         norm = frobenius(shear)
         mu, lam = elasticity.mu, elasticity.lam
         dgamma = norm + self.alpha * (3 * lam + 2 * mu) / (2 * mu) * trace
         tip, cone = trace > 0, (trace <= 0) & (dgamma > 0)
         returned = moved - dgamma * safe_divide(shear, norm * jnp.ones_like(shear))
-        new = jnp.where(tip, 0, jnp.where(cone, returned, moved))
-        if self.cohesion is not None:
-            new = new + self.cohesion * I
+        flowed = jnp.where(tip, 0, returned) + apex * I
         yields = tip | cone
-        if history is not None:
-            yields = yields | (history != 0)
-            history = jnp.where(yields, history + jnp.trace(eps) - jnp.trace(new), history)
-        return new, yields, history
+        if history is None:
+            return flowed, yields, None
+        # Inside the cone the volume gained before is given back in full.
+        new = jnp.where(yields, flowed, eps + gained / 3 * I)
+        history = jnp.where(yields, gained + jnp.trace(eps) - jnp.trace(new), 0)
+        return new, jnp.ones_like(yields), history
 
 
 def _nonnegative(a: Any) -> Any:
@@ -212,7 +236,8 @@ class HerschelBulkley(AbstractPlasticity):
     On `s = ‖μ dev b̄‖`, `b̄ = J^(−2/3) Fe Feᵀ`, above `s_Y = √(2/3) σ_Y`: h = 1 gives
     `s = s_tr − (s_tr − s_Y)/(1 + η/(2 μ Δt))`, other h the root of
     `η^(1/h) (s_tr − s) = 2 μ Δt (s − s_Y)^(1/h)`. Volume is kept exactly: det b̄ = 1.
-    Steady shear at h = 1: `τ = σ_Y/√3 + (η/2) γ̇`.
+    Steady shear at h = 1: `τ = σ_Y/√3 + (η/2) γ̇`. Where the stretches of a trial state differ by
+    a factor of 1e6 (in single precision 30) `det b̄ = 1` is lost to rounding.
 
     Args:
         yield_stress: σ_Y, Pa, uniaxial: yields at `‖dev τ‖ = √(2/3) σ_Y`. Not comparable with

@@ -70,8 +70,9 @@ class FixedCorotatedSVD(AbstractElasticity):
         sigma = _singular_values(identity(H) + H)
         return self.mu * jnp.sum((sigma - 1) ** 2) + self.lam / 2 * (jnp.prod(sigma) - 1) ** 2
 
-    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+    def tangent_bound(self, H: Matrix3, dimension: int, history: Array | None = None) -> Scalar:
         """That of `FixedCorotated`, Pa."""
+        del history
         return FixedCorotated(self.E, self.nu).tangent_bound(H, dimension)
 
 
@@ -108,16 +109,18 @@ class StVKHenckySVD(AbstractElasticity):
         eps = _hencky(_singular_values(identity(H) + H))
         return self.mu * jnp.sum(eps * eps) + self.lam / 2 * jnp.sum(eps) ** 2
 
-    def clamped(self, H: Matrix3) -> Bool[Array, ""]:
+    def clamped(self, H: Matrix3, history: Array | None = None) -> Bool[Array, ""]:
         """Whether a principal stretch is below 1e-4."""
+        del history
         return StVKHencky(self.E, self.nu).clamped(H)
 
     def elliptic(self, H: Matrix3) -> Bool[Array, ""]:
         """Whether waves still travel in every direction."""
         return StVKHencky(self.E, self.nu).elliptic(H)
 
-    def tangent_bound(self, H: Matrix3, dimension: int) -> Scalar:
+    def tangent_bound(self, H: Matrix3, dimension: int, history: Array | None = None) -> Scalar:
         """That of `StVKHencky`, Pa."""
+        del history
         return StVKHencky(self.E, self.nu).tangent_bound(H, dimension)
 
 
@@ -145,7 +148,12 @@ class AbstractPrincipalPlasticity(AbstractPlasticity):
         _, yields, new = self.principal(_singular_values(F), history, elasticity, dt)
         upright = det(F) > 0
         new = jax.tree.map(functools.partial(jnp.where, upright), new, history)
-        return jnp.where(yields & upright, isotropic(Z, F) - identity(H), H), new
+        flowed = isotropic(Z, F) - identity(H)
+        same = H
+        if history is not None:
+            # An elastic state stays bit-identical, and still depends on what is remembered.
+            same = jax.lax.stop_gradient(H) + (flowed - jax.lax.stop_gradient(flowed))
+        return jnp.where(upright, jnp.where(yields, flowed, same), H), new
 
     def goes_with(self, elasticity: AbstractElasticity) -> bool:
         """With the Hencky law in either form."""
@@ -236,11 +244,11 @@ class DruckerPragerSVD(AbstractPrincipalPlasticity):
         tip, cone = trace > 0, (trace <= 0) & (dgamma > 0)
         new = jnp.where(tip, 0, eps - jnp.where(cone, dgamma, 0) * direction) + c
         yields = tip | cone
-        if history is not None:
-            # What was remembered moves even an elastic state, as far as the cone lets it.
-            yields = yields | (history != 0)
-            history = jnp.where(yields, history + jnp.sum(trial) - jnp.sum(new), history)
-        return jnp.exp(new), yields, history
+        if history is None:
+            return jnp.exp(new), yields, None
+        # Inside the cone the volume gained before is given back in full.
+        left = jnp.where(yields, history + jnp.sum(trial) - jnp.sum(new), 0)
+        return jnp.exp(new), yields | (history != 0), left
 
 
 @final
