@@ -5,14 +5,19 @@ gradients.
 """
 
 from pgjax.render.camera import Camera as Camera
+from pgjax.render.cameras import load_cameras as load_cameras
 from pgjax.render.gaussians import Gaussians as Gaussians
 from pgjax.render.gaussians import Similarity as Similarity
 from pgjax.render.gaussians import bound_stretch as bound_stretch
 from pgjax.render.gaussians import concatenate as concatenate
 from pgjax.render.gaussians import deform as deform
+from pgjax.render.load import load_gaussians as load_gaussians
 from pgjax.render.media import VideoWriter as VideoWriter
 from pgjax.render.media import save_image as save_image
 from pgjax.render.media import save_video as save_video
+from pgjax.render.needles import AxisReport as AxisReport
+from pgjax.render.needles import measure_axes as measure_axes
+from pgjax.render.needles import split_long as split_long
 from pgjax.render.ply import load_ply as load_ply
 from pgjax.render.ply import save_ply as save_ply
 from pgjax.render.rasterize import Image as Image

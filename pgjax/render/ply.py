@@ -2,7 +2,8 @@
 
 One vertex is one Gaussian: `x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*`, with a logit
 opacity, logarithmic scales, a quaternion wxyz that need not be normalised, and the harmonics above
-degree 0 channel by channel (all of red, then green, then blue).
+degree 0 channel by channel (all of red, then green, then blue). The compressed layout of PlayCanvas
+is read, too: `compressed.py` knows what its columns mean.
 """
 
 import difflib
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from pgjax.render import compressed
 from pgjax.render._files import replacing
 from pgjax.render.gaussians import Gaussians
 from pgjax.render.harmonics import COUNTS, rotate_coefficients
@@ -41,6 +43,7 @@ def columns(k: int) -> list[str]:
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians in the layout of 3D Gaussian Splatting, harmonics of degree 0 to 3.
 
+    The compressed layout of PlayCanvas (`.compressed.ply`) is recognised and read as well.
     Gaussians with NaN or infinite values, or with a quaternion of length zero, are left out and
     counted in a warning.
 
@@ -48,16 +51,41 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
         ValueError: the file is missing, is not a complete `.ply`, lacks columns, or holds nothing
             that can be drawn.
     """
+    file = existing_file(path)
+    return finite_gaussians(file, read_ply(file))
+
+
+def existing_file(path: str | os.PathLike[str]) -> Path:
+    """The path, if there is a file."""
     file = Path(path)
     if not file.is_file():
         raise ValueError(f"There is no file {file}.")
+    return file
+
+
+def read_ply(file: Path) -> list[np.ndarray]:
+    """The arguments of `Gaussians.from_scales`, in double precision, of either layout.
+
+    Raises:
+        ValueError: as `load_ply`.
+    """
     header = _read_header(file)
+    if header.counts.get("vertex", 0) == 0:
+        raise ValueError(f"The file {file} holds no Gaussians: it has no rows of 'vertex'.")
+    if compressed.is_compressed(header.properties):
+        compressed.require_layout(file, header.counts, header.properties)
+        elements = _read_elements(file)
+        return compressed.decode(elements["chunk"], elements["vertex"], elements.get("sh"))
     count = _checked_columns(file, header)
+    return _activated(_read_elements(file)["vertex"], count)
+
+
+def _read_elements(file: Path) -> dict[str, np.ndarray]:
+    """Each element of the file as a structured array."""
     try:
-        vertex = PlyData.read(str(file))["vertex"].data
+        return {element.name: element.data for element in PlyData.read(str(file))}
     except (PlyParseError, ValueError, OSError, MemoryError) as error:
         raise ValueError(f"The file {file} cannot be read as .ply: {error}.") from error
-    return _activated(file, vertex, count)
 
 
 def save_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
@@ -141,14 +169,7 @@ def _require_room(file: Path, header: _Header, header_size: int, binary: bool) -
 
 def _checked_columns(file: Path, header: _Header) -> int:
     """Number of harmonics k, after checking that all columns are there and of a number type."""
-    if header.counts.get("vertex", 0) == 0:
-        raise ValueError(f"The file {file} holds no Gaussians: it has no rows of 'vertex'.")
     present = header.properties["vertex"]
-    if "packed_position" in present:
-        raise ValueError(
-            f"The file {file} has the compressed layout of PlayCanvas, which is not read yet. "
-            "Convert it to the uncompressed .ply layout, for example in SuperSplat."
-        )
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest not in {3 * (k - 1) for k in COUNTS}:
         raise ValueError(
@@ -179,8 +200,8 @@ def _with_hints(missing: list[str], present: dict[str, str]) -> str:
     return ", ".join(words)
 
 
-def _activated(file: Path, vertex: np.ndarray, k: int) -> Gaussians:
-    """The columns of the file as Gaussians in the default precision."""
+def _activated(vertex: np.ndarray, k: int) -> list[np.ndarray]:
+    """The columns of the uncompressed layout as arguments of `Gaussians.from_scales`."""
 
     def group(*names: str) -> np.ndarray:
         return np.stack([np.asarray(vertex[name], dtype=np.float64) for name in names], axis=-1)
@@ -188,19 +209,30 @@ def _activated(file: Path, vertex: np.ndarray, k: int) -> Gaussians:
     n = len(vertex)
     rest = group(*columns(k)[9 : 9 + 3 * (k - 1)]) if k > 1 else np.zeros((n, 0))
     dc = group("f_dc_0", "f_dc_1", "f_dc_2")
-    quaternions = group("rot_0", "rot_1", "rot_2", "rot_3")
-    length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
-    dtype = jnp.zeros(()).dtype
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        parts = [
+    logit = np.asarray(vertex["opacity"], dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return [
             group("x", "y", "z"),
-            quaternions / length,
+            group("rot_0", "rot_1", "rot_2", "rot_3"),
             np.exp(group("scale_0", "scale_1", "scale_2")),
-            1 / (1 + np.exp(-np.asarray(vertex["opacity"], dtype=np.float64))),
+            np.where(np.isfinite(logit), 1 / (1 + np.exp(-logit)), np.nan),
             np.concatenate([dc[:, None], rest.reshape(n, 3, k - 1).transpose(0, 2, 1)], axis=1),
         ]
-        parts = [part.astype(dtype) for part in parts]
-    good = np.isfinite(np.asarray(vertex["opacity"]))
+
+
+def finite_gaussians(file: Path, parts: list[np.ndarray]) -> Gaussians:
+    """The usable Gaussians of a file in the default precision; a warning counts the others.
+
+    Args:
+        file: where they are from, for messages.
+        parts: the arguments of `Gaussians.from_scales`.
+    """
+    means, quaternions, scales, opacities, sh = parts
+    dtype, n = jnp.zeros(()).dtype, len(means)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        unit = quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
+        parts = [part.astype(dtype) for part in (means, unit, scales, opacities, sh)]
+    good = np.ones(n, dtype=bool)
     for part in parts:
         good &= np.isfinite(part.reshape(n, -1)).all(axis=1)
     _report_left_out(file, n, int(np.count_nonzero(~good)))
