@@ -13,6 +13,10 @@ from pgjax.simulate import simulate as simulate
 from pgjax.splines import BSpline as BSpline
 from pgjax.state import State as State
 from pgjax.step import step as step
+from pgjax.storage import load_state as load_state
+from pgjax.storage import load_trajectory as load_trajectory
+from pgjax.storage import save_state as save_state
+from pgjax.storage import save_trajectory as save_trajectory
 from pgjax.timestep import stable_dt as stable_dt
 from pgjax.transfer import MLS as MLS
 from pgjax.transfer import SplineGradient as SplineGradient

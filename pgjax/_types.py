@@ -24,8 +24,12 @@ __all__ = [
     "as_float_array",
     "concrete",
     "is_parameter",
+    "nonnegative",
     "parameter",
+    "positive",
     "require",
+    "require_like",
+    "require_vector",
 ]
 
 
@@ -77,3 +81,32 @@ def require(name: str, value: Any, rule: str, holds: Any) -> None:
         index = tuple(int(i) for i in bad[0])
         where = f" at index {index} ({len(bad)} bad entries)" if index else ""
         raise ValueError(f"Argument `{name}` must {rule}, but is {array[index]!s}{where}.")
+
+
+def positive(a: Any) -> Any:
+    """Whether a number is positive and finite."""
+    return (a > 0) & (a < float("inf"))
+
+
+def nonnegative(a: Any) -> Any:
+    """Whether a number is at least 0 and finite."""
+    return (a >= 0) & (a < float("inf"))
+
+
+def require_vector(name: str, value: Array) -> None:
+    """Refuse what is not a finite vector in two or three dimensions."""
+    if value.shape not in ((2,), (3,)):
+        raise ValueError(
+            f"Argument `{name}` must be a vector of 2 or 3 numbers, but has shape {value.shape}."
+        )
+    require(name, value, "be finite", np.isfinite)
+
+
+def require_like(name: str, value: Array, other: str, reference: Array) -> None:
+    """Refuse what is not a finite vector as long as another argument."""
+    if value.shape != reference.shape:
+        raise ValueError(
+            f"Argument `{name}` must be a vector like `{other}` (shape {reference.shape}), "
+            f"but has shape {value.shape}."
+        )
+    require(name, value, "be finite", np.isfinite)

@@ -3,11 +3,16 @@
 import argparse
 import os
 import platform
+import shlex
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pgjax.scenes import Plan
 
 # jaxlib builds that compile float scatter-add on a GPU to a compare-and-swap loop.
 _SLOW_SCATTER = ("0.10.2", "0.11.0")
@@ -46,6 +51,19 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--save-ply", action="store_true", help="also write each frame as a .ply for splat viewers"
     )
+    run.add_argument(
+        "--save-trajectory",
+        action="store_true",
+        help="also write t, x, v and F of the particles of each frame as .npz",
+    )
+    run.add_argument(
+        "--resume", action="store_true", help="go on with an unfinished run in the output folder"
+    )
+    run.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say what would be compiled, needed and written, and write nothing",
+    )
     run.set_defaults(command=_run)
 
     info = commands.add_parser("info", help="print versions, devices and what will be used")
@@ -55,35 +73,118 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace) -> int:
     # Imported here: `pgjax --help` and errors in the arguments should not wait for JAX.
-    from tqdm import tqdm
-
-    from pgjax.scenes import plan, read_scene, resolve, run, summary
-    from pgjax.scenes.run import require_empty
+    from pgjax.scenes import plan, read_scene, resolve, summary
+    from pgjax.scenes.record import require_empty
 
     if options.frames is not None and options.frames < 1:
         raise ValueError(f"Argument `--frames` must be at least 1, but is {options.frames}.")
-    if options.out is not None:
+    if options.out is not None and not options.resume:
         require_empty(options.out)
-    planned = plan(read_scene(resolve(options.scene)), ply=options.ply, frames=options.frames)
-    folder = options.out or _next_folder(planned.name)
+    file = read_scene(resolve(options.scene))
+    folder, frames = options.out, options.frames
+    if options.resume:
+        folder, frames = _unfinished(options, file.name)
+    elif folder is None:
+        folder = _next_folder(file.name)
+    planned = plan(file, ply=options.ply, frames=frames)
     print(summary(planned))
-    with tqdm(total=planned.frames, unit="frame", file=sys.stderr) as bar:
+    if options.dry_run:
+        _foretell(options, planned, folder)
+        return 0
+    return _simulate(options, planned, folder)
 
-        def show(frame: int, _: int) -> None:
-            bar.update(frame - bar.n)
 
-        video = run(planned, folder, ply_frames=options.save_ply, progress=show)
+def _simulate(options: argparse.Namespace, planned: "Plan", folder: Path) -> int:
+    """Run, with a bar; what can be gone on with says how."""
+    from tqdm import tqdm
+
+    from pgjax.result import SimulationError
+    from pgjax.scenes import run
+    from pgjax.scenes.record import unfinished
+
+    try:
+        with tqdm(total=planned.frames, unit="frame", file=sys.stderr) as bar:
+
+            def show(frame: int, _: int) -> None:
+                if options.resume and not bar.n:
+                    # What was there already was not simulated in the time the bar shows.
+                    bar.initial = bar.n = max(frame - 1, 0)
+                bar.update(frame - bar.n)
+
+            video = run(
+                planned,
+                folder,
+                ply_frames=options.save_ply,
+                trajectory_frames=options.save_trajectory,
+                resume=options.resume,
+                progress=show,
+            )
+    except SimulationError:
+        # The same would happen again.
+        raise
+    except (KeyboardInterrupt, OSError, RuntimeError) as error:
+        if unfinished(folder) is None:
+            raise
+        was_stopped = isinstance(error, KeyboardInterrupt)
+        reason = "interrupted" if was_stopped else str(error).rstrip(".")
+        print(f"pgjax: {reason}; go on with: {_go_on(options, folder)}", file=sys.stderr)
+        return 130 if was_stopped else 1
     print(f"wrote      {video}")
     return 0
 
 
+def _foretell(options: argparse.Namespace, planned: "Plan", folder: Path) -> None:
+    """What a run would do, after all that could stop it at once has been checked."""
+    from pgjax.scenes.record import require_same, require_unfinished
+    from pgjax.scenes.summary import forecast
+
+    ply, trajectory = options.save_ply, options.save_trajectory
+    if options.resume:
+        record = require_unfinished(folder)
+        require_same(planned, folder, record)
+        ply, trajectory = record.ply_frames, record.trajectory_frames
+        print(f"resumes    after frame {max(record.frame, 0)} of {planned.frames}")
+    print(forecast(planned, folder, ply_frames=ply, trajectory_frames=trajectory))
+
+
+def _go_on(options: argparse.Namespace, folder: Path) -> str:
+    """The command that goes on with the run; the run itself remembers the rest."""
+    ply = [] if options.ply is None else ["--ply", str(options.ply)]
+    return shlex.join(["pgjax", "run", options.scene, *ply, "--out", str(folder), "--resume"])
+
+
+def _unfinished(options: argparse.Namespace, name: str) -> tuple[Path, int]:
+    """The folder to go on in, and the number of frames: as they were unless given."""
+    from pgjax.scenes.record import require_unfinished, unfinished
+
+    folder = options.out
+    if folder is None:
+        folders = [folder for folder in _folders(name) if unfinished(folder) is not None]
+        if len(folders) > 1:
+            raise ValueError(
+                f"Argument `--out` must say which run to resume: {', '.join(map(str, folders))} "
+                f"are unfinished."
+            )
+        folder = folders[0] if folders else Path("out") / name
+    record = require_unfinished(folder)
+    return folder, record.frames if options.frames is None else options.frames
+
+
 def _next_folder(name: str) -> Path:
     """`out/NAME`, or `out/NAME-2`, `out/NAME-3` and so on where that is taken."""
+    folder = Path("out") / name
+    for number, taken in enumerate(_folders(name), start=2):
+        folder = taken.with_name(f"{name}-{number}")
+    return folder
+
+
+def _folders(name: str) -> Iterator[Path]:
+    """`out/NAME`, `out/NAME-2` and so on, as far as they hold anything."""
     folder, number = Path("out") / name, 1
     while folder.exists() and any(folder.iterdir()):
+        yield folder
         number += 1
-        folder = Path("out") / f"{name}-{number}"
-    return folder
+        folder = folder.with_name(f"{name}-{number}")
 
 
 def _info(options: argparse.Namespace) -> int:

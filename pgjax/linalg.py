@@ -7,13 +7,14 @@ isotropic *function*, and that is smooth: `spectral_map` (of a symmetric matrix)
 forward and reverse.
 """
 
+import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 from pgjax._safe import safe_divide
-from pgjax._types import Array, Bool, Matrix3, Scalar, Vector3
+from pgjax._types import Array, Bool, Float, Matrix3, Scalar, Vector3
 
 # Cyclic Jacobi converges quadratically: errors after these are at rounding level.
 _SWEEPS = {"float32": 4, "float64": 6}
@@ -272,3 +273,33 @@ def cofactor(A: Matrix3) -> Matrix3:
 def deviator(A: Matrix3) -> Matrix3:
     """`A − tr(A)/3 I`."""
     return A - (jnp.trace(A) / 3) * jnp.eye(3, dtype=A.dtype)
+
+
+def rotation_change(turn: Float[Array, " k"]) -> Array:
+    """`R − I` of a rotation vector `(3,)`, or of an angle `(1,)` in two dimensions.
+
+    `R − I = a W + b W²`, `a = sin θ/θ`, `b = (1 − cos θ)/θ²` (Rodrigues): no cancellation for
+    small angles, and smooth at 0.
+    """
+    square = jnp.sum(turn * turn)
+    # Below θ² = 1/20 six terms of the series are exact in double precision.
+    small = square < 0.05
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    a = jnp.where(small, _series(square, 1), jnp.sin(angle) / angle)
+    b = jnp.where(small, _series(square, 2), 2 * (jnp.sin(angle / 2) / angle) ** 2)
+    zero = jnp.zeros_like(square)
+    if turn.shape[0] == 1:
+        W = jnp.stack([jnp.stack([zero, -turn[0]]), jnp.stack([turn[0], zero])])
+    else:
+        x, y, z = turn
+        rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+        W = jnp.stack([jnp.stack(row) for row in rows])
+    return a * W + b * (W @ W)
+
+
+def _series(square: Scalar, first: int) -> Scalar:
+    """`Σ (−θ²)ᵏ/(2k + first)!`, k < 7: `sin θ/θ` for first = 1, `(1 − cos θ)/θ²` for 2."""
+    total = jnp.zeros_like(square)
+    for k in reversed(range(7)):
+        total = 1 / math.factorial(2 * k + first) - square * total
+    return total

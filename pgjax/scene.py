@@ -8,8 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pgjax._types import Array, Float, Scalar, as_float_array, concrete, parameter, require
-from pgjax.boundary import AbstractParticleCondition
+from pgjax._types import (
+    Array,
+    Float,
+    Scalar,
+    as_float_array,
+    concrete,
+    parameter,
+    positive,
+    require,
+)
 from pgjax.grid import Grid
 from pgjax.models import Material
 from pgjax.models.material import particle_axes
@@ -31,7 +39,8 @@ class Scene(eqx.Module):
         counts: number of particles of each material, in order. Not needed for one material.
         gravity: m/s², `(d,)`; zero by default.
         boundaries: conditions of the grid, `(x, v, t) -> v` for one node, applied in order.
-        particle_conditions: prescribed motion and pushes of particles.
+        particle_conditions: prescribed motion, forces and wind, `(particles, t, dt) -> particles`
+            for all particles (`boundary.Particles`), applied in order.
         body_force: acceleration `b(X0, t) -> (d,)` of one particle, m/s²; `X0` is needed.
         X0: initial positions for `body_force`, m, `(p, d)`.
         spline: interpolation, quadratic by default.
@@ -46,7 +55,7 @@ class Scene(eqx.Module):
     counts: tuple[int, ...] = eqx.field(static=True)
     gravity: Array
     boundaries: tuple[Callable, ...]
-    particle_conditions: tuple[AbstractParticleCondition, ...]
+    particle_conditions: tuple[Callable, ...]
     body_force: Callable | None
     X0: Array | None
     spline: BSpline
@@ -63,7 +72,7 @@ class Scene(eqx.Module):
         counts: Sequence[int] | None = None,
         gravity: Any = None,
         boundaries: Sequence[Callable] = (),
-        particle_conditions: Sequence[AbstractParticleCondition] = (),
+        particle_conditions: Sequence[Callable] = (),
         body_force: Callable | None = None,
         X0: Any = None,
         spline: BSpline | None = None,
@@ -90,7 +99,7 @@ class Scene(eqx.Module):
         _check_shape("volumes", self.volumes, (n,))
         if n == 0:
             raise ValueError("Argument `volumes` must hold at least one particle, but is empty.")
-        require("volumes", self.volumes, "be positive and finite", _positive)
+        require("volumes", self.volumes, "be positive and finite", positive)
         if len(self.counts) != len(self.materials) or sum(self.counts) != n:
             raise ValueError(
                 f"Argument `counts` must give the particles of each of {len(self.materials)} "
@@ -105,7 +114,9 @@ class Scene(eqx.Module):
             _check_shape(name, value, ())
             require(name, value, "be at least 0 (1/s)", lambda a: a >= 0)
         for condition in self.particle_conditions:
-            _check_shape("mask", condition.mask, (n,))
+            mask = getattr(condition, "mask", None)
+            if mask is not None:
+                _check_shape("mask", mask, (n,))
         if self.body_force is not None and self.X0 is None:
             raise ValueError("Argument `X0` must be given with `body_force`, but is None.")
         if self.X0 is not None:
@@ -286,7 +297,3 @@ def _check_inside(scene: Scene, position: Array) -> None:
             f"{known[index] + np.asarray(scene.grid.origin)} "
             f"({int(outside.any(axis=1).sum())} particles are outside)."
         )
-
-
-def _positive(a: Any) -> Any:
-    return (a > 0) & np.isfinite(a)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Scalar
+from pgjax.boundary import Particles
 from pgjax.models.elasticity import volume_change
 from pgjax.models.material import cast, particle_axes
 from pgjax.result import Condition
@@ -48,16 +49,17 @@ def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Arr
 
     They act before anything is checked, so that a NaN from a user's function is found.
     """
-    v, held = state.v, jnp.zeros_like(state.alive)
+    v = state.v
     if scene.body_force is not None:
         acceleration = jax.vmap(scene.body_force, in_axes=(0, None))(scene.X0, t)
         v = v + dt * acceleration.astype(state.dtype)
     mass = jnp.where(state.alive, scene.masses, 0)
+    x = _where(state.alive & _finite(state.position), state.x, 0)
+    particles = Particles(x, v, state.C, mass, jnp.zeros_like(state.alive))
     for condition in scene.particle_conditions:
-        v = condition.velocity(v, mass, t, dt)
-        held = held | condition.held(t)
-    C = jnp.where(held[:, None, None], 0, state.C)
-    return held, eqx.tree_at(lambda s: (s.v, s.C), state, (v, C))
+        particles = condition(particles, t, dt)
+    v, C = particles.v, particles.C
+    return particles.held, eqx.tree_at(lambda s: (s.v, s.C), state, (v, C))
 
 
 def _stress(scene: Scene, state: State, t: Scalar) -> tuple[State, Stencil, Float[Array, "p 3 3"]]:
@@ -180,7 +182,8 @@ def _update(
     """Move and deform the particles, then return to the yield surface."""
     alive = state.alive
     v = jnp.where(held[:, None], state.v, v)
-    C = jnp.where(held[:, None, None], 0, _damp_shear(C, scene.shear_damping, dt))
+    damped = _damp_shear(C, scene.shear_damping, dt)
+    C = jnp.where(held[:, None, None], state.C, damped)
     L = _embed(L)
     He, history = _return_map(scene, state, _stretched(state.He, L, dt), dt)
     H = None if state.H is None else _where(alive, _stretched(state.H, L, dt), state.H)

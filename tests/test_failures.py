@@ -20,6 +20,8 @@ ORIGIN = np.array([-0.4, 0.0])
 H = 0.1
 N = 12
 DT = 1e-3
+REST = boundary.Steady((0.0, 0.0))
+HELD = boundary.Collider(boundary.Cuboid((0.2, 0.6), (2.0, 2.0)), boundary.Sticky())
 
 
 def points(n=8, seed=0):
@@ -157,8 +159,7 @@ def test_far_above_the_bound_nothing_crashes():
 )
 def test_soft_conditions_warn_and_are_counted(material, stretches, condition):
     """One deformed particle among eight at rest, held in place: exactly that one is counted."""
-    held = boundary.GridVelocity((0.2, 0.6), (2.0, 2.0), (0.0, 0.0))
-    scene = scene_of(material=material, boundaries=[held])
+    scene = scene_of(material=material, boundaries=[HELD])
     state = started(scene, v=(0.0, 0.0))
     state = eqx.tree_at(
         lambda s: s.He, state, state.He.at[2].set(jnp.diag(jnp.asarray(stretches)) - jnp.eye(3))
@@ -182,15 +183,14 @@ def test_what_single_precision_does_not_resolve_is_said():
     scene = scene_of()
     state = pgjax.initial_state(scene, points(), dtype=np.float32)
     state = replaced(state, "He", 0, jnp.diag(jnp.asarray([1e3, 0.0, -0.9995], jnp.float32)))
-    held = boundary.GridVelocity((0.2, 0.6), (2.0, 2.0), (0.0, 0.0))
-    scene = scene_of(boundaries=[held])
+    scene = scene_of(boundaries=[HELD])
     end = pgjax.simulate(scene, state, dt=1e-7, frames=1, substeps=1, throw=False)
     assert int(end.status.count[Condition.F32_RESOLUTION]) == 2  # At the start and the end.
 
 
 def test_a_crowded_cell_is_said():
     n = 30_001
-    scene = scene_of(n, boundaries=[boundary.GridVelocity((0.2, 0.6), (2.0, 2.0), (0.0, 0.0))])
+    scene = scene_of(n, boundaries=[HELD])
     x = np.full((n, 2), 0.25) + 1e-6 * np.arange(n)[:, None]
     state = pgjax.initial_state(scene, x, dtype=np.float32)
     with pytest.warns(SimulationWarning, match="F32_RESOLUTION"):
@@ -266,18 +266,16 @@ def simulated(**changes):
         (lambda: boundary.Box((0, 0), (1, -1)), "`upper` must be above `lower`"),
         (lambda: boundary.Separating(-0.1), "`friction` must be at least 0"),
         (
-            lambda: boundary.GridVelocity((0, 0), (1, 1), (0, 0), start=2.0, end=1.0),
+            lambda: boundary.Collider(boundary.Sphere((0, 0), 1.0), start=2.0, end=1.0),
             "`end` must be after `start`",
         ),
         (
             lambda: boundary.ParticleImpulse(np.zeros(8, bool), (1.0, 0.0)),
             "`mask` must select at least one particle",
         ),
-        (lambda: boundary.ParticleVelocity(np.ones(8), (1.0, 0.0)), "`mask` must be a boolean"),
+        (lambda: boundary.ParticleMotion(np.ones(8), REST), "`mask` must be a boolean"),
         (
-            lambda: scene_of(
-                particle_conditions=[boundary.ParticleVelocity(np.ones(3, bool), (0.0, 0.0))]
-            ),
+            lambda: scene_of(particle_conditions=[boundary.ParticleMotion(np.ones(3, bool), REST)]),
             r"`mask` must have shape \(8,\)",
         ),
     ],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pgjax.models as pm
-from pgjax.boundary import HalfSpace, Slip
+from pgjax.boundary import Collider, HalfSpace, Slip
 from pgjax.grid import Grid
 from pgjax.result import Condition
 from pgjax.scene import Scene, initial_state
@@ -28,7 +28,7 @@ def column(h=0.05):
     side = h / 4 + h / 2 * np.arange(16)
     x = np.stack(np.meshgrid(side[:8], side, indexing="ij"), axis=-1).reshape(-1, 2)
     x[:, 1] += 2 * h
-    floor = HalfSpace([0.0, 2 * h], [0.0, 1.0], Slip())
+    floor = Collider(HalfSpace([0.0, 2 * h], [0.0, 1.0]), Slip())
     grid = Grid((0, 0), (4, 14), h, periodic=(True, False))
     material = pm.Material(pm.Fluid(4e5), density=1000.0)
     options = {"gravity": (0, -10.0), "boundaries": [floor], "grid_damping": 60.0}

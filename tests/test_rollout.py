@@ -8,7 +8,16 @@ import pytest
 
 import pgjax
 import pgjax.models as pm
-from pgjax.boundary import GridVelocity, HalfSpace, ParticleImpulse, ParticleVelocity, Separating
+from pgjax.boundary import (
+    Collider,
+    Cuboid,
+    HalfSpace,
+    ParticleImpulse,
+    ParticleMotion,
+    Separating,
+    Steady,
+    Sticky,
+)
 from pgjax.simulate import checkpointed_scan
 
 H, DT = 0.1, 1e-3
@@ -26,7 +35,7 @@ def particles(n, seed=0, lower=0.4, size=0.3, d=2):
 def two_bodies(**kwargs):
     """Six particles of metal and six of jelly falling on a floor with friction."""
     x, v = particles(12)
-    floor = HalfSpace([0.0, 0.43], [0.0, 1.0], Separating(0.3))
+    floor = Collider(HalfSpace([0.0, 0.43], [0.0, 1.0]), Separating(0.3))
     scene = pgjax.Scene(
         pgjax.Grid([0.0, 0.0], (12, 12), H),
         [METAL, JELLY],
@@ -325,11 +334,11 @@ def test_plane_strain_is_a_slab(measure):
 
 
 @pytest.mark.float64
-def test_particle_velocity_is_followed_exactly(measure):
+def test_led_particles_follow_exactly(measure):
     """Held particles move with the value while the window lasts, whatever pulls at them."""
     held = np.arange(9) < 4
     value, start, end = np.array([0.3, -0.2]), 10 * DT, 30 * DT
-    hold = ParticleVelocity(held, value, start=start, end=end)
+    hold = ParticleMotion(held, Steady(value), start=start, end=end)
     scene, state = one_body(gravity=[0.0, -9.8], particle_conditions=(hold,))
     before = run(scene, state, 10)
     during = run(scene, before, 20)
@@ -342,10 +351,12 @@ def test_particle_velocity_is_followed_exactly(measure):
 
 
 @pytest.mark.float64
-def test_grid_velocity_moves_with_its_box():
+def test_a_sticky_body_takes_what_is_inside_along():
     """Nodes in the box have the velocity in the window: the particles inside follow it."""
     velocity = np.array([0.5, 0.25])
-    push = GridVelocity([0.55, 0.55], [0.35, 0.35], velocity, start=2 * DT, end=6 * DT)
+    start, end = 2 * DT, 6 * DT
+    box = Cuboid([0.55, 0.55], [0.35, 0.35])
+    push = Collider(box, Sticky(), Steady(velocity, start=start), start=start, end=end)
     scene, state = one_body(boundaries=(push,))
     before = run(scene, state, 2)
     assert not np.allclose(before.v, velocity)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from pgjax._safe import frobenius, safe_divide
-from pgjax._types import Array, Matrix3, Scalar, as_float_array, parameter, require
+from pgjax._types import Array, Matrix3, Scalar, as_float_array, nonnegative, parameter, require
 from pgjax.linalg import cofactor, deviator, spectral_map
 from pgjax.models.elasticity import (
     AbstractElasticity,
@@ -114,9 +114,9 @@ class VonMises(AbstractHenckyPlasticity):
     def __check_init__(self):
         require("yield_stress", self.yield_stress, "be at least 0 Pa", lambda a: a >= 0)
         if self.hardening is not None:
-            require("hardening", self.hardening, "be at least 0 and finite", _nonnegative)
+            require("hardening", self.hardening, "be at least 0 and finite", nonnegative)
         if self.softening is not None:
-            require("softening", self.softening, "be at least 0 and finite", _nonnegative)
+            require("softening", self.softening, "be at least 0 and finite", nonnegative)
             if self.hardening is not None:
                 raise ValueError(
                     "Argument `softening` must be None where `hardening` is given, but is "
@@ -183,7 +183,7 @@ class DruckerPrager(AbstractHenckyPlasticity):
         require("friction_angle", self.friction_angle, "be at least 0 degrees", lambda a: a >= 0)
         require("friction_angle", self.friction_angle, "be below 90 degrees", lambda a: a < 90)
         if self.cohesion is not None:
-            require("cohesion", self.cohesion, "be at least 0 and finite", _nonnegative)
+            require("cohesion", self.cohesion, "be at least 0 and finite", nonnegative)
 
     @property
     def alpha(self) -> Array:
@@ -218,10 +218,6 @@ class DruckerPrager(AbstractHenckyPlasticity):
         new = jnp.where(yields, flowed, eps + gained / 3 * I)
         history = jnp.where(yields, gained + jnp.trace(eps) - jnp.trace(new), 0)
         return new, jnp.ones_like(yields), history
-
-
-def _nonnegative(a: Any) -> Any:
-    return (a >= 0) & (a < float("inf"))
 
 
 def _h_or_one(h: Any) -> Array | None:

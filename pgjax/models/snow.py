@@ -1,12 +1,12 @@
 """Snow: stretches that cannot leave a narrow range, and stiffness that grows with packing."""
 
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from pgjax._types import Array, Matrix3, Scalar, Vector3, parameter, require
+from pgjax._types import Array, Matrix3, Scalar, Vector3, nonnegative, parameter, require
 from pgjax.linalg import spectral_map
 from pgjax.models.elasticity import (
     SMALLEST_STRETCH,
@@ -45,7 +45,7 @@ class Snow(AbstractElasticity):
     hardening: Array = parameter(default=10.0)
 
     def __check_init__(self):
-        require("hardening", self.hardening, "be at least 0 and finite", _nonnegative)
+        require("hardening", self.hardening, "be at least 0 and finite", nonnegative)
 
     def _exponent(self, history: Array | None) -> Array:
         """`ξ (1 − J_p)`, without its limit."""
@@ -79,10 +79,6 @@ class Snow(AbstractElasticity):
         return self.stiffening(history) * bound
 
 
-def _nonnegative(a: Any) -> Any:
-    return (a >= 0) & (a < float("inf"))
-
-
 @final
 class CriticalStretches(AbstractPlasticity):
     """Elastic stretches kept in `[1 − θ_c, 1 + θ_s]` (Stomakhin et al. 2013); goes with `Snow`.
@@ -103,7 +99,7 @@ class CriticalStretches(AbstractPlasticity):
     def __check_init__(self):
         below_one = lambda a: (a >= 0) & (a < 1)  # noqa: E731
         require("critical_compression", self.critical_compression, "be in [0, 1)", below_one)
-        require("critical_stretch", self.critical_stretch, "be at least 0 and finite", _nonnegative)
+        require("critical_stretch", self.critical_stretch, "be at least 0 and finite", nonnegative)
 
     def initial_history(self) -> float:
         """`J_p`, the plastic change of volume."""

@@ -1,11 +1,11 @@
 """Viscous stress beside an elastic one: Kelvin–Voigt damping, and what fluids share with it."""
 
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from pgjax._types import Array, Matrix3, Scalar, parameter, require
+from pgjax._types import Array, Matrix3, Scalar, nonnegative, parameter, require
 from pgjax.models.elasticity import SMALLEST_VOLUME_RATIO, volume_change
 from pgjax.models.law import AbstractElasticity, AbstractLaw
 
@@ -23,11 +23,7 @@ def strain_rate(L: Matrix3) -> Matrix3:
 
 def require_viscosity(value: Array) -> None:
     """Refuse a viscosity that is negative or not finite."""
-    require("viscosity", value, "be at least 0 and finite (Pa s)", _nonnegative)
-
-
-def _nonnegative(a: Any) -> Any:
-    return (a >= 0) & (a < float("inf"))
+    require("viscosity", value, "be at least 0 and finite (Pa s)", nonnegative)
 
 
 @final

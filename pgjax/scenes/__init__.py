@@ -8,9 +8,9 @@ from pgjax.scenes.build import plan as plan
 from pgjax.scenes.build import presets as presets
 from pgjax.scenes.reader import SceneError as SceneError
 from pgjax.scenes.run import run as run
-from pgjax.scenes.run import summary as summary
 from pgjax.scenes.schema import SceneFile as SceneFile
 from pgjax.scenes.schema import read_scene as read_scene
+from pgjax.scenes.summary import summary as summary
 
 
 def resolve(name: str) -> Path:

@@ -1,18 +1,45 @@
 """Reading a TOML table strictly: every key is known, typed and in range, or the error says why."""
 
+import contextlib
 import difflib
 import math
+import reprlib
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, final
+from typing import Any, NamedTuple, TypeVar, final
+
+import numpy as np
 
 T = TypeVar("T")
-_REQUIRED: Any = object()
+REQUIRED: Any = object()
+_LARGEST = 2**31 - 1
+# Of a value of any length a message shows as much as fits into a line.
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = 80
 
 
 class SceneError(ValueError):
     """A scene file cannot be used; the message names file, key, rule and value."""
+
+
+class Range(NamedTuple):
+    """Bounds of a number; all numbers are finite."""
+
+    above: float = -math.inf
+    at_least: float = -math.inf
+    below: float = math.inf
+
+    def holds(self, value: Any) -> Any:
+        """Whether a number, or which entries of an array, are within the bounds."""
+        inside = (value > self.above) & (value >= self.at_least) & (value < self.below)
+        return np.isfinite(value) & inside
+
+    def __str__(self) -> str:
+        bounds = [f"above {self.above:g}"] if self.above > -math.inf else []
+        bounds += [f"at least {self.at_least:g}"] if self.at_least > -math.inf else []
+        bounds += [f"below {self.below:g}"] if self.below < math.inf else []
+        return f"a finite number {' and '.join(bounds)}".rstrip()
 
 
 @final
@@ -22,58 +49,65 @@ class Table:
     Args:
         name: how messages call it, e.g. `ficus.toml [grid]`.
         data: the parsed table.
+        folder: what paths are relative to.
+
+    Attributes:
+        lengths: lengths of the files with one value per Gaussian that were read here or in a table
+            within this one, by the place where they are named.
     """
 
-    def __init__(self, name: str, data: Mapping[str, Any]):
-        self._name = name
+    def __init__(self, name: str, data: Mapping[str, Any], folder: Path = Path()):
+        self.name = name
+        self.folder = folder
+        self.lengths: dict[str, int] = {}
         self._data = dict(data)
-        self._known: list[str] = []
+        self._known: dict[str, None] = {}
+        self._chosen = ""
 
     def error(self, key: str, rule: str) -> SceneError:
         """The error of a key whose value breaks a rule."""
-        return SceneError(f"{self._name}: `{key}` must {rule}, but is {self._data.get(key)!r}.")
+        value = _SHORT.repr(self._data.get(key))
+        return SceneError(f"{self.name}: `{key}` must {rule}, but is {value}.")
 
     def has(self, key: str) -> bool:
         """Whether the key is given."""
         return key in self._data
 
+    def is_a(self, key: str, kind: type) -> bool:
+        """Whether the key is given, with a value of this kind."""
+        return isinstance(self._data.get(key), kind)
+
     def _take(self, key: str, default: Any) -> Any:
-        self._known.append(key)
-        if key not in self._data and default is _REQUIRED:
-            misspelt = difflib.get_close_matches(key, self._data, n=1)
+        self._known[key] = None
+        if key not in self._data and default is REQUIRED:
+            others = [k for k in self._data if k not in self._known]
+            misspelt = difflib.get_close_matches(key, others, n=1)
             hint = f" (is `{misspelt[0]}` meant?)" if misspelt else ""
-            raise SceneError(f"{self._name}: `{key}` is missing{hint}.")
+            raise SceneError(f"{self.name}: `{key}` is missing{hint}.")
         return self._data.get(key, default)
 
-    def number(
-        self,
-        key: str,
-        default: Any = _REQUIRED,
-        *,
-        above: float = -math.inf,
-        at_least: float = -math.inf,
-        below: float = math.inf,
-    ) -> Any:
-        """A finite number in a range; the default is returned as it is."""
+    def number(self, key: str, default: Any = REQUIRED, **bounds: float) -> Any:
+        """A finite number in a `Range`; the default is returned as it is."""
         value = self._take(key, default)
         if key not in self._data:
             return value
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if not _is_number(value):
             raise self.error(key, "be a number")
-        if not (math.isfinite(value) and above < value < below and value >= at_least):
-            bounds = [f"above {above:g}"] if above > -math.inf else []
-            bounds += [f"at least {at_least:g}"] if at_least > -math.inf else []
-            bounds += [f"below {below:g}"] if below < math.inf else []
-            raise self.error(key, f"be a finite number {' and '.join(bounds)}".rstrip())
+        allowed = Range(**bounds)
+        if not allowed.holds(_as_float(value)):
+            raise self.error(key, f"be {allowed}")
         return float(value)
 
-    def integer(self, key: str, default: Any = _REQUIRED, *, at_least: int = 1) -> Any:
+    def integer(
+        self, key: str, default: Any = REQUIRED, *, at_least: int = 1, at_most: int = _LARGEST
+    ) -> Any:
         """A whole number."""
         value = self._take(key, default)
-        if key in self._data and (
-            isinstance(value, bool) or not isinstance(value, int) or value < at_least
-        ):
-            raise self.error(key, f"be a whole number, at least {at_least}")
+        if key not in self._data:
+            return value
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        if not whole or not at_least <= value <= at_most:
+            raise self.error(key, f"be a whole number, at least {at_least}, at most {at_most}")
         return value
 
     def boolean(self, key: str, default: bool) -> bool:
@@ -83,56 +117,103 @@ class Table:
             raise self.error(key, "be true or false")
         return value
 
-    def text(self, key: str, default: Any = _REQUIRED) -> Any:
+    def booleans(self, key: str, default: tuple[bool, bool, bool]) -> tuple[bool, bool, bool]:
+        """Three times true or false, one for each direction."""
+        value = self._take(key, list(default))
+        if not isinstance(value, list) or len(value) != 3 or {type(v) for v in value} != {bool}:
+            raise self.error(key, "be a list of 3 times true or false")
+        return value[0], value[1], value[2]
+
+    def text(self, key: str, default: Any = REQUIRED) -> Any:
         """A string."""
         value = self._take(key, default)
         if key in self._data and not isinstance(value, str):
             raise self.error(key, "be a string")
         return value
 
-    def vector(self, key: str, default: Any = _REQUIRED, *, size: int = 3) -> Any:
-        """A list of finite numbers."""
+    def path(self, key: str, default: Any = REQUIRED) -> Any:
+        """A path, relative to the scene file; it may name nothing yet."""
+        text = self.text(key, default)
+        if key not in self._data:
+            return text
+        try:
+            return self.folder / Path(text).expanduser()
+        except RuntimeError:
+            raise self.error(key, "name a file in a home folder that is known") from None
+
+    def existing_path(self, key: str) -> Path:
+        """A path, relative to the scene file, of a file or folder that is there."""
+        path = self.path(key)
+        if not path.exists():
+            raise missing_file(f"{self.name}: `{key}`", path)
+        return path
+
+    def vector(self, key: str, default: Any = REQUIRED, *, size: int = 3, **bounds: float) -> Any:
+        """A list of finite numbers in a `Range`."""
         value = self._take(key, default)
         if key not in self._data:
             return value
-        numbers = isinstance(value, Sequence) and all(
-            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
-            for v in value
-        )
+        numbers = isinstance(value, Sequence) and all(_is_number(v) for v in value)
         if not numbers or len(value) != size:
-            raise self.error(key, f"be a list of {size} finite numbers")
+            raise self.error(key, f"be a list of {size} numbers")
+        allowed = Range(**bounds)
+        if not all(allowed.holds(_as_float(v)) for v in value):
+            raise self.error(key, f"be a list of {size} numbers, each {allowed}")
         return tuple(float(v) for v in value)
 
-    def choice(self, key: str, choices: Mapping[str, T], default: Any = _REQUIRED) -> T:
+    def integers(self, key: str) -> tuple[int, ...]:
+        """A list of at least one whole number."""
+        value = self._take(key, REQUIRED)
+        whole = isinstance(value, list) and all(
+            isinstance(v, int) and not isinstance(v, bool) for v in value
+        )
+        if not whole or not value:
+            raise self.error(key, "be a list of whole numbers")
+        return tuple(value)
+
+    def choice(self, key: str, choices: Mapping[str, T], default: Any = REQUIRED) -> T:
         """What a name stands for."""
         name = self.text(key, default)
         if name not in choices:
-            hint = _nearest(str(name), choices)
-            raise self.error(key, f"be one of {', '.join(choices)}{hint}")
+            raise self.error(key, f"be one of {', '.join(choices)}{nearest(str(name), choices)}")
         return choices[name]
+
+    def kind(
+        self, key: str, readers: Mapping[str, Callable[["Table"], T]], default: Any = REQUIRED
+    ) -> T:
+        """What the reader of a named kind makes of this table; other keys may depend on it."""
+        reader = self.choice(key, readers, default)
+        self._chosen = f' with {key} = "{self._data.get(key, default)}"'
+        return reader(self)
 
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> "Table":
         """A sub-table; an absent one reads as the default."""
-        value = self._take(key, _REQUIRED if default is None else default)
+        value = self._take(key, REQUIRED if default is None else default)
         if not isinstance(value, Mapping):
             raise self.error(key, "be a table")
-        return Table(f"{self._name} [{key}]", value)
+        inner = Table(f"{self.name} [{key}]", value, self.folder)
+        inner.lengths = self.lengths
+        return inner
+
+    def optional(self, key: str, reader: Callable[["Table"], T]) -> T | None:
+        """What a reader makes of a sub-table; None where it is absent."""
+        if key in self._data:
+            return self.table(key).read(reader)
+        self._known[key] = None
+        return None
 
     def tables(self, key: str, *, required: bool = False) -> list["Table"]:
         """A list of tables, `[[key]]`."""
-        value = self._take(key, _REQUIRED if required else [])
+        value = self._take(key, REQUIRED if required else [])
         if not isinstance(value, list) or not all(isinstance(v, Mapping) for v in value):
             raise self.error(key, f"be written as [[{key}]] tables")
-        return [Table(f"{self._name} [[{key}]] {i + 1}", v) for i, v in enumerate(value)]
+        names = (f"{self.name} [[{key}]] {i + 1}" for i in range(len(value)))
+        return [Table(name, v, self.folder) for name, v in zip(names, value, strict=True)]
 
     def read(self, reader: Callable[["Table"], T]) -> T:
         """Apply a reader to this table; `ValueError`s name the table, leftovers are errors."""
-        try:
+        with naming(self.name):
             result = reader(self)
-        except SceneError:
-            raise
-        except ValueError as error:
-            raise SceneError(f"{self._name}: {error}") from error
         self.close()
         return result
 
@@ -141,21 +222,56 @@ class Table:
         for key in self._data:
             if key not in self._known:
                 raise SceneError(
-                    f"{self._name}: `{key}` is not a known key{_nearest(key, self._known)}; "
-                    f"allowed are {', '.join(self._known)}."
+                    f"{self.name}: `{key}` is not a known key{self._chosen}"
+                    f"{nearest(key, self._known)}; allowed are {', '.join(self._known)}."
                 )
 
 
-def _nearest(name: str, known: Any) -> str:
+@contextlib.contextmanager
+def naming(name: str) -> Iterator[None]:
+    """Put a name in front of the message of a `ValueError` that is not a `SceneError` yet."""
+    try:
+        yield
+    except SceneError:
+        raise
+    except ValueError as error:
+        raise SceneError(f"{name}: {error}") from error
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The hint at the known name that is most like this one; nothing if none is."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f" (did you mean `{close[0]}`?)" if close else ""
+
+
+def missing_file(where: str, path: Path) -> SceneError:
+    """The error of a path that names nothing, with the nearest name in its folder."""
+    return SceneError(f"{where} must name a file, but there is no {path}{_neighbour(path)}.")
+
+
+def _neighbour(path: Path) -> str:
+    others = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    return nearest(path.name, others)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _as_float(value: float) -> float:
+    """The number; infinity for an integer that is too large."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
 
 
 def parse(path: Path) -> Table:
     """The root table of a TOML file."""
     if not path.is_file():
-        raise SceneError(f"The scene file {path} does not exist.")
+        raise SceneError(f"The scene file {path} does not exist{_neighbour(path)}.")
     try:
-        return Table(path.name, tomllib.loads(path.read_text(encoding="utf-8")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path} is not a TOML file: {error}") from error
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{path} is not a TOML file: {error}.") from error
+    return Table(path.name, data, path.parent)

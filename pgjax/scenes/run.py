@@ -1,30 +1,47 @@
-"""The main job: a scene goes in, a video of it moving comes out."""
+"""The main job: a scene goes in, a video of it moving comes out.
 
-import json
+Whatever ends a run before its time, another one goes on from what it left (`record`).
+"""
+
+import dataclasses
+import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, final
 
 import jax
 import numpy as np
-from jax.typing import ArrayLike
 
-from pgjax.models import Material
 from pgjax.render import (
     Gaussians,
-    VideoWriter,
     bound_stretch,
     concatenate,
     deform,
+    media,
     render,
     save_image,
     save_ply,
+    save_video,
 )
 from pgjax.result import ERRORS, Condition, SimulationError, SimulationWarning
 from pgjax.scenes.build import Plan
+from pgjax.scenes.record import (
+    Record,
+    begun,
+    picture_path,
+    record_path,
+    reopened,
+    state_path,
+    write_json,
+)
 from pgjax.simulate import Trajectory, simulate
 from pgjax.state import State
+from pgjax.storage import durably_replacing, flush, load_state, save_arrays, save_state
+
+# A state is kept once this many times as long has passed as keeping the last one took.
+_PATIENCE = 20
 
 
 def run(
@@ -32,17 +49,28 @@ def run(
     folder: Path,
     *,
     ply_frames: bool = False,
+    trajectory_frames: bool = False,
+    resume: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Simulate, draw and write frame by frame; memory does not grow with the length.
 
     Writes `video.mp4`, `first.png`, `last.png`, `run.json` and, if asked, `ply/00000.ply` …, the
-    moving and the still Gaussians of each frame in the model's own coordinates.
+    moving and the still Gaussians of each frame in the model's own coordinates, and
+    `trajectory/00000.npz` …, each with the time `t` (s) and `x` (m), `v` (m/s) and `F` of the
+    particles in those of the simulation.
+
+    A run that was interrupted, was killed or ran out of disk leaves `resume/` in the folder. With
+    `resume` it goes on, and the result is, on the CPU, the same to the last bit as if it had
+    never stopped. Ctrl-C and a masked particle leave the video of the frames so far as well.
 
     Args:
         plan: what to run.
-        folder: where to write; created, must be empty.
-        ply_frames: whether to write each frame as a `.ply`.
+        folder: where to write; created, must be empty unless a run is resumed.
+        ply_frames: whether to write each frame as a `.ply`. A resumed run goes on as it began.
+        trajectory_frames: whether to write the particles of each frame; likewise.
+        resume: go on with the unfinished run in the folder. The plan must be the one that it
+            began with; `frames` may be larger.
         progress: called as `progress(frame, frames)` after each frame.
 
     Returns:
@@ -50,64 +78,153 @@ def run(
 
     Raises:
         SimulationError: a particle was masked. The frames up to then are written.
-        ValueError: the folder is not empty.
+        ValueError: the folder is not empty, or holds nothing that this plan could go on with.
     """
-    require_empty(folder)
-    (folder / "ply" if ply_frames else folder).mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
-    video = folder / "video.mp4"
-    state, frame, bounded, image = plan.state, 0, 0, np.zeros((0, 0, 3))
-    with VideoWriter(video, fps=plan.fps) as writer:
-        for frame, state in enumerate(_states(plan)):
-            gaussians, count = carried(plan, state.x, state.F)
-            bounded = max(bounded, count)
-            image = _draw(plan, gaussians, frame)
-            writer.add(image)
-            if frame == 0:
-                save_image(folder / "first.png", image)
-            elif progress is not None:
-                progress(frame, plan.frames)
-            if ply_frames:
-                save_ply(
-                    folder / "ply" / f"{frame:05d}.ply",
-                    gaussians.transformed(plan.to_simulation.inverse()),
-                )
-    save_image(folder / "last.png", image)
-    seconds = time.perf_counter() - started
-    record = _record(plan, state, frame, seconds) | {"most_bounded_gaussians": bounded}
-    (folder / "run.json").write_text(json.dumps(record, indent=1) + "\n")
-    if bounded:
-        warnings.warn(
-            f"Up to {bounded} Gaussians in a frame were drawn with their stretch bounded to "
-            f"`camera.max_stretch` = {plan.view.max_stretch:g}; the simulation is not affected.",
-            stacklevel=2,
+    extras = {"ply_frames": ply_frames, "trajectory_frames": trajectory_frames}
+    record = reopened(plan, folder, extras) if resume else begun(plan, folder, extras)
+    recorder = _Recorder(plan, folder, record)
+    try:
+        recorder.play(progress)
+    except KeyboardInterrupt:
+        recorder.close()
+        raise
+    recorder.close()
+    recorder.report()
+    # Without its record nothing is taken for unfinished, whatever else is left.
+    record_path(folder).unlink()
+    shutil.rmtree(folder / "resume")
+    return folder / "video.mp4"
+
+
+@final
+class _Recorder:
+    """Draws frame after frame, and keeps in the folder what it takes to go on."""
+
+    def __init__(self, plan: Plan, folder: Path, record: Record):
+        self._plan = plan
+        self._folder = folder
+        # The last frame of which all files are written, and its state.
+        self._latest = record, _state_of(plan, folder, record)
+        self._kept = record.frame
+        # Files that may not have reached the disk yet.
+        self._loose: list[Path] = []
+        self._cost = 0.0
+        self._kept_at = time.perf_counter()
+        self._started = self._kept_at - record.seconds
+
+    def play(self, progress: Callable[[int, int], None] | None) -> None:
+        """Run what is left of the plan, as far as nothing goes wrong."""
+        record, start = self._latest
+        for frame, state in _states(self._plan, start, max(record.frame, 0)):
+            if frame > record.frame:
+                self._add(frame, state)
+            if frame > 0 and progress is not None:
+                progress(frame, self._plan.frames)
+
+    def _add(self, frame: int, state: State) -> None:
+        """Draw and write a frame, and keep its state if it is time."""
+        record, _ = self._latest
+        gaussians, bounded = carried(self._plan, state.x, state.F)
+        picture = picture_path(self._folder, frame)
+        save_image(picture, _draw(self._plan, gaussians, frame))
+        files = record.files(self._folder, frame)
+        for path in files:
+            self._write(path, state, gaussians)
+        self._loose += [picture, *files]
+        record = dataclasses.replace(
+            record, frame=frame, most_bounded=max(bounded, record.most_bounded)
         )
-    _report(state.status.messages(), state.status.messages(ERRORS), frame)
-    return video
+        self._latest = record, state
+        if time.perf_counter() - self._kept_at >= _PATIENCE * self._cost:
+            self._keep()
+
+    def _write(self, path: Path, state: State, gaussians: Gaussians) -> None:
+        if path.suffix == ".ply":
+            save_ply(path, gaussians.transformed(self._plan.to_simulation.inverse()))
+            return
+        t = np.asarray(int(state.step) * self._plan.dt, state.dtype)
+        x, v, F = (np.asarray(a) for a in (state.x, state.v, state.F))
+        save_arrays(path, {"t": t, "x": x, "v": v, "F": F})
+
+    def _keep(self) -> None:
+        """From here on the run can go on from its latest frame."""
+        started = time.perf_counter()
+        record, state = self._latest
+        record = dataclasses.replace(record, seconds=started - self._started)
+        for path in {*self._loose, *(file.parent for file in self._loose)}:
+            flush(path)
+        path = state_path(self._folder, record.frame)
+        save_state(path, state)
+        # This decides: before it the previous state counts, after it the new one.
+        record.write(self._folder)
+        for other in path.parent.glob("state-*.npz"):
+            if other != path:
+                other.unlink()
+        self._latest, self._kept, self._loose = (record, state), record.frame, []
+        self._kept_at = time.perf_counter()
+        self._cost = self._kept_at - started
+
+    def close(self) -> None:
+        """Keep the latest frame; write the video, the two pictures and `run.json`."""
+        record, state = self._latest
+        if record.frame < 0:
+            return
+        if record.frame > self._kept:
+            self._keep()
+        last, fps = record.frame, self._plan.fps
+        pictures = (_picture(self._folder, frame) for frame in range(last + 1))
+        save_video(self._folder / "video.mp4", pictures, fps=fps)
+        for name, frame in (("first.png", 0), ("last.png", last)):
+            with durably_replacing(self._folder / name) as temporary:
+                shutil.copyfile(picture_path(self._folder, frame), temporary)
+        seconds = time.perf_counter() - self._started
+        write_json(self._folder / "run.json", _summed_up(self._plan, state, record, seconds))
+
+    def report(self) -> None:
+        """Warn of what makes the result doubtful, raise what makes it useless."""
+        record, state = self._latest
+        if record.most_bounded:
+            warnings.warn(
+                f"Up to {record.most_bounded} Gaussians in a frame were drawn with their stretch "
+                f"bounded to `camera.max_stretch` = {self._plan.view.max_stretch:g}; the "
+                f"simulation is not affected.",
+                stacklevel=3,
+            )
+        errors = state.status.messages(ERRORS)
+        for message in state.status.messages():
+            if message not in errors:
+                warnings.warn(message, SimulationWarning, stacklevel=3)
+        if errors:
+            raise SimulationError(f"Stopped at frame {record.frame}: {' '.join(errors)}")
 
 
-def require_empty(folder: Path) -> None:
-    """Raise a `ValueError` if the folder holds anything."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+def _state_of(plan: Plan, folder: Path, record: Record) -> State:
+    """Where a run goes on."""
+    if record.frame < 0:
+        return plan.state
+    path = state_path(folder, record.frame)
+    state = load_state(path, plan.scene)
+    steps = int(plan.state.step) + record.frame * plan.substeps
+    if int(state.step) != steps:
         raise ValueError(
-            f"Argument `out` must be a new or an empty folder, so that nothing is overwritten, "
-            f"but {folder} is not."
+            f"The file {path} must hold the state after {steps} steps, but holds the one after "
+            f"{int(state.step)}."
         )
+    return state
 
 
-def _states(plan: Plan) -> Iterator[State]:
-    """The initial state and that after each frame, as far as nothing goes wrong.
+def _states(plan: Plan, state: State, frame: int) -> Iterator[tuple[int, State]]:
+    """The given frame and state and those that follow, as far as nothing goes wrong.
 
     The next frame is already being simulated while the caller draws this one.
     """
-    state = plan.state
-    for _ in range(plan.frames):
-        ahead = _advance(plan, state)
-        yield state
-        state = ahead.final
-        if not bool(state.status.ok):
-            break
-    yield state
+    while True:
+        goes_on = frame < plan.frames and bool(state.status.ok)
+        ahead = _advance(plan, state) if goes_on else None
+        yield frame, state
+        if ahead is None:
+            return
+        frame, state = frame + 1, ahead.final
 
 
 def _advance(plan: Plan, state: State) -> Trajectory:
@@ -143,15 +260,12 @@ def _draw(plan: Plan, gaussians: Gaussians, frame: int) -> np.ndarray:
     return np.clip(np.asarray(image.rgb), 0, 1)
 
 
-def _report(messages: list[str], errors: list[str], frame: int) -> None:
-    for message in messages:
-        if message not in errors:
-            warnings.warn(message, SimulationWarning, stacklevel=3)
-    if errors:
-        raise SimulationError(f"Stopped at frame {frame}: {' '.join(errors)}")
+def _picture(folder: Path, frame: int) -> np.ndarray:
+    """A frame as it was drawn; `save_video` makes the same bytes of it as `save_image` did."""
+    return np.asarray(media.imageio.imread(picture_path(folder, frame)), np.float64) / 255
 
 
-def _record(plan: Plan, state: State, frame: int, seconds: float) -> dict:
+def _summed_up(plan: Plan, state: State, record: Record, seconds: float) -> dict[str, Any]:
     return {
         "scene": plan.name,
         "particles": plan.scene.particle_count,
@@ -159,7 +273,8 @@ def _record(plan: Plan, state: State, frame: int, seconds: float) -> dict:
         "grid": plan.scene.grid.node_shape,
         "dt": plan.dt,
         "substeps": plan.substeps,
-        "frames": frame,
+        "frames": record.frame,
+        "finished": record.frame == plan.frames and bool(state.status.ok),
         "fps": plan.fps,
         "seconds": round(seconds, 3),
         "status": {
@@ -168,45 +283,5 @@ def _record(plan: Plan, state: State, frame: int, seconds: float) -> dict:
             if int(state.status.count[c])
         },
         "jax": jax.__version__,
+        "most_bounded_gaussians": record.most_bounded,
     }
-
-
-def summary(plan: Plan) -> str:
-    """What will be compiled, in a few lines."""
-    scene = plan.scene
-    bound = float(scene.elastic_limit(scene.rest_sound_speed()))
-    grid = scene.grid
-    lines = [
-        f"scene      {plan.name}: {scene.particle_count} particles"
-        + (f", {len(plan.still)} Gaussians that do not move" if len(plan.still) else ""),
-        *(
-            f"material   {_describe(m)}, {count} particles"
-            for m, count in zip(scene.materials, scene.counts, strict=True)
-        ),
-        f"grid       {' x '.join(map(str, grid.shape))} cells of {float(grid.h):.4g} m, "
-        f"{'quadratic' if scene.spline.degree == 2 else 'cubic'} spline, "
-        f"{type(scene.scheme).__name__}",
-        f"time step  {plan.dt:.4g} s, {plan.dt / bound:.2f} of the stable one at rest; "
-        f"{plan.substeps} steps a frame, {plan.frames} frames at {plan.fps:g} per second",
-        f"computing  {state_kind(plan)} on {jax.devices()[0].platform.upper()}, "
-        f"JAX {jax.__version__}",
-    ]
-    return "\n".join(lines)
-
-
-def state_kind(plan: Plan) -> str:
-    """The precision, in words."""
-    return {"float32": "single precision", "float64": "double precision"}[plan.state.dtype.name]
-
-
-def _describe(material: Material) -> str:
-    law = type(material.elasticity).__name__
-    if material.plasticity is not None:
-        law += f" + {type(material.plasticity).__name__}"
-    E, nu = (np.asarray(a) for a in (material.elasticity.E, material.elasticity.nu))
-    return f"{law} (E {_range(E)} Pa, nu {_range(nu)}, {_range(material.density)} kg/m3)"
-
-
-def _range(a: ArrayLike) -> str:
-    a = np.asarray(a)
-    return f"{a.min():.4g}" if a.min() == a.max() else f"{a.min():.4g} to {a.max():.4g}"

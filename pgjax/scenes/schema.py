@@ -1,60 +1,23 @@
 """The scene file: which tables and keys there are, and what they become.
 
 All lengths are in metres of the simulation: z points up, the simulated part of the model is
-scaled to `model.size`, stands on z = 0 and is centred on x = y = 0. Angles are in degrees.
+scaled to `model.size` and stands on `model.position`. Angles are in degrees. The keys of one table
+are read in one module of this package; the reference for users is `docs/scene-files.md`.
 """
 
 import dataclasses
-import math
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from pgjax import models
-from pgjax.boundary import (
-    AbstractContact,
-    Box,
-    GridVelocity,
-    HalfSpace,
-    ParticleImpulse,
-    ParticleVelocity,
-    Separating,
-    Slip,
-    Sticky,
-)
-from pgjax.models import Material
-from pgjax.scenes.reader import Table, parse
+from pgjax.scenes.camera import CameraPart, camera
+from pgjax.scenes.conditions import ParticlesPart, particles
+from pgjax.scenes.materials import MaterialPart, material
+from pgjax.scenes.model import ModelPart, model
+from pgjax.scenes.reader import SceneError, Table, nearest, parse
+from pgjax.scenes.regions import Triple
+from pgjax.scenes.walls import BoundaryPart, boundary
 from pgjax.splines import BSpline
 from pgjax.transfer import MLS, AbstractScheme, SplineGradient
-
-Triple = tuple[float, float, float]
-
-
-@dataclasses.dataclass(frozen=True)
-class Region:
-    """An axis-aligned box."""
-
-    lower: Triple
-    upper: Triple
-
-    def contains(self, x: np.ndarray) -> np.ndarray:
-        """Which points are in the box, faces included."""
-        return np.all((x >= np.asarray(self.lower)) & (x <= np.asarray(self.upper)), axis=-1)
-
-
-@dataclasses.dataclass(frozen=True)
-class ModelPart:
-    """Where the Gaussians come from and which of them move."""
-
-    ply: Path | None
-    procedural: str | None
-    up: Triple | None
-    opacity_above: float
-    region: Region | None
-    size: float
-    velocity: Triple
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +27,7 @@ class GridPart:
     lower: Triple
     upper: Triple
     spacing: float
+    periodic: tuple[bool, bool, bool]
     spline: BSpline
     scheme: AbstractScheme
 
@@ -79,105 +43,115 @@ class TimePart:
 
 
 @dataclasses.dataclass(frozen=True)
-class CameraPart:
-    """A camera on an orbit, and how the Gaussians are drawn."""
-
-    target: Triple
-    azimuth: float
-    elevation: float
-    radius: float
-    turn: float
-    fov: float
-    width: int
-    height: int
-    background: Triple
-    max_stretch: float
-
-
-@dataclasses.dataclass(frozen=True)
 class SceneFile:
-    """A scene file, read and checked."""
+    """A scene file, read and checked.
+
+    Attributes:
+        name: of the scene.
+        source: the name of the file, for messages.
+        models: where the Gaussians come from.
+        grid: the grid.
+        time: frames and time step.
+        camera: from where it is seen.
+        gravity: m/s².
+        grid_damping: 1/s.
+        shear_damping: 1/s.
+        materials: in order; the first that takes a particle owns it.
+        boundaries: conditions of the grid.
+        particle_conditions: conditions of particles.
+    """
 
     name: str
-    model: ModelPart
+    source: str
+    models: tuple[ModelPart, ...]
     grid: GridPart
     time: TimePart
     camera: CameraPart
     gravity: Triple
     grid_damping: float
     shear_damping: float
-    materials: tuple[tuple[Material, Region | None], ...]
-    boundaries: tuple[Callable, ...]
-    # Each makes a condition from the positions of the particles.
-    particle_conditions: tuple[Callable[[np.ndarray], Any], ...]
+    materials: tuple[MaterialPart, ...]
+    boundaries: tuple[BoundaryPart, ...]
+    particle_conditions: tuple[ParticlesPart, ...]
 
 
 def read_scene(path: Path) -> SceneFile:
     """Read a scene file.
 
     Raises:
-        SceneError: a key is unknown, missing, of the wrong type or out of range.
+        SceneError: a key is unknown, missing, of the wrong type or out of range, or a file is
+            missing or unusable. (Models are loaded by `plan`.)
     """
-    root = parse(path)
-    return root.read(lambda table: _scene(table, path))
+    return scene_from(parse(path), path.stem)
 
 
-def _scene(root: Table, path: Path) -> SceneFile:
-    name = root.text("name", path.stem)
-    model = root.table("model").read(lambda t: _model(t, path.parent))
+def scene_from(root: Table, name: str) -> SceneFile:
+    """The scene of a parsed file; `name` is its name if it has none of its own."""
+    return root.read(lambda table: _scene(table, name))
+
+
+def _scene(root: Table, name: str) -> SceneFile:
+    name = root.text("name", name)
+    models = _models(root)
     forces = root.table("forces", {})
     gravity = forces.vector("gravity", (0.0, 0.0, 0.0))
     grid_damping = forces.number("grid_damping", 0.0, at_least=0)
     shear_damping = forces.number("shear_damping", 0.0, at_least=0)
     forces.close()
-    materials = tuple(t.read(_material) for t in root.tables("material", required=True))
+    materials = tuple(t.read(material) for t in root.tables("material", required=True))
     if not materials:
         raise root.error("material", "hold at least one [[material]]")
+    conditions = tuple(t.read(particles) for t in root.tables("particles"))
+    _require_models(models, (*materials, *conditions))
     return SceneFile(
         name=name,
-        model=model,
+        source=root.name,
+        models=models,
         grid=root.table("grid").read(_grid),
         time=root.table("time", {}).read(_time),
-        camera=root.table("camera", {}).read(lambda t: _camera(t, model.size)),
+        camera=root.table("camera", {}).read(lambda t: camera(t, models[0])),
         gravity=gravity,
         grid_damping=grid_damping,
         shear_damping=shear_damping,
         materials=materials,
-        boundaries=tuple(t.read(_boundary) for t in root.tables("boundary")),
-        particle_conditions=tuple(t.read(_particles) for t in root.tables("particles")),
+        boundaries=tuple(t.read(boundary) for t in root.tables("boundary")),
+        particle_conditions=conditions,
     )
 
 
-def _model(t: Table, folder: Path) -> ModelPart:
-    ply, procedural = t.text("ply", None), t.text("procedural", None)
-    if (ply is None) == (procedural is None):
-        raise t.error("ply", "be given, or `procedural`, but not both")
-    up = t.vector("up", None)
-    if up is not None and not any(up):
-        raise t.error("up", "not be zero")
-    return ModelPart(
-        ply=None if ply is None else folder / Path(ply).expanduser(),
-        procedural=procedural,
-        up=up,
-        opacity_above=t.number("opacity_above", 0.02, at_least=0, below=1),
-        region=_region(t, "region"),
-        size=t.number("size", 1.0, above=0),
-        velocity=t.vector("velocity", (0.0, 0.0, 0.0)),
-    )
+def _models(root: Table) -> tuple[ModelPart, ...]:
+    """One `[model]`, or several `[[model]]` with different names."""
+    if not root.is_a("model", list):
+        return (root.table("model").read(model),)
+    models = tuple(t.read(model) for t in root.tables("model"))
+    if not models:
+        raise root.error("model", "hold at least one [[model]]")
+    names = [m.name for m in models if m.name is not None]
+    for m in models:
+        if names.count(m.name or "") > 1:
+            raise SceneError(
+                f"{m.label}: `name` must differ from model to model, but is {m.name!r}."
+            )
+    return models
 
 
-def _region(t: Table, key: str) -> Region | None:
-    if not t.has(key):
-        t.table(key, {})
-        return None
-
-    def box(table: Table) -> Region:
-        region = Region(table.vector("lower"), table.vector("upper"))
-        if not all(a < b for a, b in zip(region.lower, region.upper, strict=True)):
-            raise table.error("upper", f"be above `lower` = {list(region.lower)}")
-        return region
-
-    return t.table(key).read(box)
+def _require_models(
+    models: tuple[ModelPart, ...], parts: Iterable[MaterialPart | ParticlesPart]
+) -> None:
+    """Models that are referred to exist; values per Gaussian say of which model they are."""
+    names = [m.name for m in models if m.name is not None]
+    for takes in (part.takes for part in parts):
+        if takes.model is not None and takes.model not in names:
+            raise SceneError(
+                f"{takes.name}: `model` must be the `name` of a model, "
+                f"{'one of ' + ', '.join(names) if names else 'but none has one'}"
+                f"{nearest(takes.model, names)}, but is {takes.model!r}."
+            )
+        if takes.model is None and takes.lengths and len(models) > 1:
+            raise SceneError(
+                f"{takes.name}: `model` must say which of the {len(models)} models the values in "
+                f"the file belong to, but is missing."
+            )
 
 
 def _grid(t: Table) -> GridPart:
@@ -185,6 +159,7 @@ def _grid(t: Table) -> GridPart:
         lower=t.vector("lower"),
         upper=t.vector("upper"),
         spacing=t.number("spacing", above=0),
+        periodic=t.booleans("periodic", (False, False, False)),
         spline=t.choice("spline", {"quadratic": BSpline(2), "cubic": BSpline(3)}, "quadratic"),
         scheme=t.choice(
             "scheme", {"spline-gradient": SplineGradient(), "mls": MLS()}, "spline-gradient"
@@ -202,123 +177,3 @@ def _time(t: Table) -> TimePart:
         dt=t.number("dt", None, above=0),
         fraction=t.number("fraction", 0.5, above=0, below=1),
     )
-
-
-def _camera(t: Table, size: float) -> CameraPart:
-    return CameraPart(
-        target=t.vector("target", (0.0, 0.0, 0.4 * size)),
-        azimuth=t.number("azimuth", -60.0),
-        elevation=t.number("elevation", 12.0, above=-90, below=90),
-        radius=t.number("radius", 2.4 * size, above=0),
-        turn=t.number("turn", 0.0),
-        fov=t.number("fov", 40.0, above=0, below=170),
-        width=t.integer("width", 480, at_least=16),
-        height=t.integer("height", 480, at_least=16),
-        background=t.vector("background", (1.0, 1.0, 1.0)),
-        max_stretch=t.number("max_stretch", 4.0, at_least=1),
-    )
-
-
-_LAWS = {
-    "fixed-corotated": models.FixedCorotated,
-    "stvk-hencky": models.StVKHencky,
-    "neo-hookean": models.NeoHookean,
-    "dev-vol-neo-hookean": models.DevVolNeoHookean,
-}
-
-
-def _material(t: Table) -> tuple[Material, Region | None]:
-    law = t.choice("law", _LAWS)(E=t.number("E", above=0), nu=t.number("nu", above=-1, below=0.5))
-    plasticity = None
-    if t.has("plasticity"):
-        plasticity = t.table("plasticity").read(_plasticity)
-    else:
-        t.table("plasticity", {})
-    density = t.number("density", above=0)
-    return Material(law, plasticity, density), _region(t, "region")
-
-
-def _plasticity(t: Table) -> models.AbstractPlasticity:
-    return t.choice(
-        "type",
-        {
-            "drucker-prager": _drucker_prager,
-            "von-mises": _von_mises,
-            "herschel-bulkley": _herschel_bulkley,
-        },
-    )(t)
-
-
-def _drucker_prager(t: Table) -> models.AbstractPlasticity:
-    return models.DruckerPrager(
-        t.number("friction_angle", at_least=0, below=90),
-        t.number("cohesion", None, at_least=0),
-        volume_correction=t.boolean("volume_correction", False),
-    )
-
-
-def _von_mises(t: Table) -> models.AbstractPlasticity:
-    return models.VonMises(
-        t.number("yield_stress", at_least=0), t.number("hardening", None, at_least=0)
-    )
-
-
-def _herschel_bulkley(t: Table) -> models.AbstractPlasticity:
-    return models.HerschelBulkley(
-        t.number("yield_stress", at_least=0),
-        t.number("viscosity", at_least=0),
-        h=t.number("h", 1, above=0),
-    )
-
-
-def _contact(t: Table) -> AbstractContact:
-    kind = t.choice(
-        "contact", {"sticky": Sticky, "slip": Slip, "separating": Separating}, "separating"
-    )
-    friction = t.number("friction", None, at_least=0)
-    if kind is Separating:
-        return Separating() if friction is None else Separating(friction)
-    if friction is not None:
-        raise t.error("friction", "be left out unless `contact` is separating")
-    return kind()
-
-
-def _window(t: Table) -> dict[str, Any]:
-    return {"start": t.number("start", 0.0), "end": t.number("end", math.inf)}
-
-
-def _boundary(t: Table) -> Callable:
-    def half_space() -> Callable:
-        return HalfSpace(t.vector("point"), t.vector("normal"), _contact(t))
-
-    def box() -> Callable:
-        return Box(t.vector("lower"), t.vector("upper"), _contact(t))
-
-    def velocity() -> Callable:
-        return GridVelocity(
-            t.vector("center"), t.vector("half_size"), t.vector("velocity"), **_window(t)
-        )
-
-    return t.choice("type", {"half-space": half_space, "box": box, "velocity": velocity})()
-
-
-def _particles(t: Table) -> Callable[[np.ndarray], Any]:
-    def velocity() -> Callable[[np.ndarray], Any]:
-        value, window = t.vector("velocity"), _window(t)
-        return lambda mask: ParticleVelocity(mask, value, **window)
-
-    def impulse() -> Callable[[np.ndarray], Any]:
-        momentum = t.vector("momentum")
-        start, duration = t.number("start", 0.0), t.number("duration", 0.0, at_least=0)
-        return lambda mask: ParticleImpulse(mask, momentum, start, duration)
-
-    make = t.choice("type", {"velocity": velocity, "impulse": impulse})()
-    region = _region(t, "region")
-
-    def condition(x: np.ndarray) -> Any:
-        mask = np.ones(len(x), bool) if region is None else region.contains(x)
-        if not mask.any():
-            raise t.error("region", "hold at least one particle")
-        return make(mask)
-
-    return condition

@@ -10,7 +10,7 @@ import numpy as np
 
 import pgjax
 import pgjax.models as pm
-from pgjax.boundary import HalfSpace, Separating
+from pgjax.boundary import Collider, HalfSpace, Separating
 from pgjax.models.material import cast
 from pgjax.transfer import Payload, scatter, stencil
 
@@ -87,7 +87,7 @@ def scene(p: dict) -> pgjax.Scene:
         np.full(COUNT * PER_BLOCK, (H / 2) ** 2),
         counts=(PER_BLOCK,) * COUNT,
         gravity=p["gravity"],
-        boundaries=(HalfSpace(FLOOR * H * up, up, Separating(FRICTION)),),
+        boundaries=(Collider(HalfSpace(FLOOR * H * up, up), Separating(FRICTION)),),
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from scenes import SCHEMES, MissingTimeStep, elastic_strain, largest, roll, wide
 
 import pgjax.models as pm
-from pgjax.boundary import HalfSpace, Separating
+from pgjax.boundary import Collider, HalfSpace, Separating
 from pgjax.grid import Grid
 from pgjax.scene import Scene, initial_state
 from pgjax.transfer import SplineGradient
@@ -202,7 +202,7 @@ def thrown(d, name, x=None, *, turn=None, shift=0, order=None, dtype):
     R = np.eye(3)
     R[:d, :d] = Q
     volumes = H**d * rng.uniform(0.05, 0.2, n)
-    floor = HalfSpace(place(0.4 * up + 0.2), Q @ up, Separating(0.3))
+    floor = Collider(HalfSpace(place(0.4 * up + 0.2), Q @ up), Separating(0.3))
     scene = Scene(
         Grid(np.zeros(d), (14,) * d, H),
         pm.Material(pm.FixedCorotated(E, NU), density=RHO),
@@ -282,7 +282,7 @@ def in_units(length, time, mass, dtype):
         0.1 * (H * length) ** d * np.ones(n * len(laws)),
         counts=(n,) * len(laws),
         gravity=np.array([1.0, -9.8]) * length / time**2,
-        boundaries=(HalfSpace([0.0, 0.3 * length], [0.0, 1.0], Separating(0.3)),),
+        boundaries=(Collider(HalfSpace([0.0, 0.3 * length], [0.0, 1.0]), Separating(0.3)),),
         grid_damping=0.5 / time,
         shear_damping=2.0 / time,
     )

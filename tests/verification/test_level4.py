@@ -6,7 +6,7 @@ import pytest
 from scenes import SCHEMES, MissingTimeStep, lattice, roll, wide, without_affine
 
 import pgjax.models as pm
-from pgjax.boundary import HalfSpace, Slip, Sticky
+from pgjax.boundary import Collider, HalfSpace, Slip, Sticky
 from pgjax.grid import Grid
 from pgjax.scene import Scene, initial_state
 
@@ -84,7 +84,7 @@ def free_bar(n, name, **kwargs):
         Grid(np.zeros(2), (1, n + 4), h, periodic=(True, False)),
         pm.Material(pm.NeoHookean(manufactured.E, manufactured.NU), density=manufactured.RHO),
         np.full(len(Y), (h / 2) ** 2),
-        boundaries=(HalfSpace([0.0, 0.0], [0.0, 1.0], Slip()),),
+        boundaries=(Collider(HalfSpace([0.0, 0.0], [0.0, 1.0]), Slip()),),
         spline=spline,
         scheme=scheme,
     )
@@ -160,7 +160,7 @@ def slope(ny, theta, seconds):
         pm.Material(pm.StVKHencky(E, nu), pm.DruckerPrager(30.0), density),
         (h / 2) ** 2 / np.exp(strain),
         gravity=[along, down],
-        boundaries=(HalfSpace([0.0, 0.0], [0.0, 1.0], Sticky()),),
+        boundaries=(Collider(HalfSpace([0.0, 0.0], [0.0, 1.0]), Sticky()),),
     )
     dt = 0.5 * float(scene.elastic_limit(scene.rest_sound_speed()))
     every = int(seconds / dt / frames)

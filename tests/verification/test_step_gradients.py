@@ -9,7 +9,7 @@ import pytest
 
 import pgjax
 import pgjax.models as pm
-from pgjax.boundary import HalfSpace, Separating
+from pgjax.boundary import Collider, HalfSpace, Separating
 
 pytestmark = pytest.mark.float64
 
@@ -39,7 +39,7 @@ def step_problem(d, degree, x=None, H=None, v=1.0, gained=0.01, **changes):
         impact.H**d * rng.uniform(0.05, 0.2, count),
         counts=(n,) * impact.COUNT,
         gravity=v * rng.normal(size=d),
-        boundaries=(HalfSpace(np.full(d, 0.413), normal, Separating(0.2)),),
+        boundaries=(Collider(HalfSpace(np.full(d, 0.413), normal), Separating(0.2)),),
         spline=pgjax.BSpline(degree),
         grid_damping=0.7,
         shear_damping=3.0,

@@ -1,0 +1,29 @@
+"""Boundary conditions of the grid, and conditions of particles."""
+
+from pgjax.boundary.colliders import AbstractGridCondition as AbstractGridCondition
+from pgjax.boundary.colliders import Box as Box
+from pgjax.boundary.colliders import Collider as Collider
+from pgjax.boundary.contact import AbstractContact as AbstractContact
+from pgjax.boundary.contact import Separating as Separating
+from pgjax.boundary.contact import Slip as Slip
+from pgjax.boundary.contact import Sticky as Sticky
+from pgjax.boundary.motion import AbstractMotion as AbstractMotion
+from pgjax.boundary.motion import KeyFrames as KeyFrames
+from pgjax.boundary.motion import Steady as Steady
+from pgjax.boundary.particles import AbstractParticleCondition as AbstractParticleCondition
+from pgjax.boundary.particles import ParticleForce as ParticleForce
+from pgjax.boundary.particles import ParticleImpulse as ParticleImpulse
+from pgjax.boundary.particles import ParticleMotion as ParticleMotion
+from pgjax.boundary.particles import Particles as Particles
+from pgjax.boundary.particles import Wind as Wind
+from pgjax.boundary.particles import release_times as release_times
+from pgjax.boundary.sampled import sample_mesh as sample_mesh
+from pgjax.boundary.sampled import sample_points as sample_points
+from pgjax.boundary.shapes import AbstractShape as AbstractShape
+from pgjax.boundary.shapes import Capsule as Capsule
+from pgjax.boundary.shapes import Complement as Complement
+from pgjax.boundary.shapes import Cuboid as Cuboid
+from pgjax.boundary.shapes import Cylinder as Cylinder
+from pgjax.boundary.shapes import HalfSpace as HalfSpace
+from pgjax.boundary.shapes import SampledSDF as SampledSDF
+from pgjax.boundary.shapes import Sphere as Sphere

@@ -1,0 +1,402 @@
+"""Shapes, motions, colliders and conditions of particles, each against an independent result."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from pgjax import boundary
+from pgjax.boundary.motion import step_of
+from pgjax.boundary.particles import Particles
+from pgjax.boundary.shapes import normal
+from pgjax.linalg import rotation_change
+
+double = pytest.mark.float64
+T0 = jnp.asarray(0.0)
+
+SHAPES_3D = {
+    "sphere": boundary.Sphere((0.1, -0.2, 0.05), 0.7),
+    "cuboid": boundary.Cuboid((0.1, 0.0, -0.1), (0.6, 0.4, 0.3)),
+    "turned cuboid": boundary.Cuboid((0.1, 0.0, -0.1), (0.6, 0.4, 0.3), (0.4, -0.9, 0.7)),
+    "cylinder": boundary.Cylinder((-0.3, 0.0, -0.4), (0.2, 0.3, 0.5), 0.45),
+    "capsule": boundary.Capsule((-0.3, 0.0, -0.2), (0.2, 0.3, 0.3), 0.4),
+}
+SHAPES_2D = {
+    "disc": boundary.Sphere((0.1, -0.2), 0.7),
+    "rectangle": boundary.Cuboid((0.1, 0.0), (0.6, 0.4)),
+    "turned rectangle": boundary.Cuboid((0.1, 0.0), (0.6, 0.4), 0.6),
+    "2-D capsule": boundary.Capsule((-0.3, 0.0), (0.2, 0.3), 0.4),
+}
+SHAPES = SHAPES_3D | SHAPES_2D
+
+
+def inside(name, x):
+    """Whether points are in a shape of the registry, from its definition."""
+    d = x.shape[1]
+    if name in ("sphere", "disc"):
+        return np.sum((x - np.array([0.1, -0.2, 0.05])[:d]) ** 2, axis=1) <= 0.49
+    if name.endswith(("cuboid", "rectangle")):
+        turn = {"turned cuboid": [0.4, -0.9, 0.7], "turned rectangle": [0, 0, 0.6]}.get(name)
+        R = np.eye(3) if turn is None else Rotation.from_rotvec(turn).as_matrix()
+        r = (x - np.array([0.1, 0.0, -0.1])[:d]) @ R[:d, :d]
+        return np.all(np.abs(r) <= np.array([0.6, 0.4, 0.3])[:d], axis=1)
+    a, b, radius = {
+        "cylinder": ([-0.3, 0.0, -0.4], [0.2, 0.3, 0.5], 0.45),
+        "capsule": ([-0.3, 0.0, -0.2], [0.2, 0.3, 0.3], 0.4),
+        "2-D capsule": ([-0.3, 0.0], [0.2, 0.3], 0.4),
+    }[name]
+    a, b = np.array(a), np.array(b)
+    s = (x - a) @ (b - a) / np.sum((b - a) ** 2)
+    if name == "cylinder":
+        across = np.linalg.norm(x - a - s[:, None] * (b - a), axis=1)
+        return (across <= radius) & (s >= 0) & (s <= 1)
+    nearest = a + np.clip(s, 0, 1)[:, None] * (b - a)
+    return np.linalg.norm(x - nearest, axis=1) <= radius
+
+
+def surface_points(name, d, pitch):
+    """Points of the surface to within `pitch`/64: sign changes on a lattice, bisected."""
+    axes = [np.arange(-1.3, 1.3, pitch)] * d
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, d)
+    within = inside(name, lattice)
+    found = []
+    for axis in range(d):
+        other = lattice + pitch * np.eye(d)[axis]
+        cut = within != inside(name, other)
+        a, b, first = lattice[cut], other[cut], within[cut]
+        for _ in range(6):
+            middle = (a + b) / 2
+            same = (inside(name, middle) == first)[:, None]
+            a, b = np.where(same, middle, a), np.where(same, b, middle)
+        found.append((a + b) / 2)
+    return np.concatenate(found)
+
+
+@double
+@pytest.mark.parametrize("name", SHAPES)
+def test_distance_is_that_to_the_surface(name):
+    """Signed distances against a dense cloud of surface points; the normal is their gradient."""
+    shape, rng = SHAPES[name], np.random.default_rng(0)
+    d = 3 if name in SHAPES_3D else 2
+    pitch = 0.02
+    tree = KDTree(surface_points(name, d, pitch))
+    x = rng.uniform(-1.2, 1.2, (400, d))
+    signed = jax.vmap(shape.signed_distance)(jnp.asarray(x))
+    np.testing.assert_array_equal(signed < 0, inside(name, x))
+    distance = tree.query(x)[0]
+    # The nearest point of the cloud is at most a pitch away along the surface.
+    far = distance > 3 * pitch
+    error = np.abs(np.abs(signed) - distance)[far]
+    # Edges and corners hold no point of the cloud.
+    assert error.max() < 1.5 * pitch
+    assert np.median(error) < pitch / 20
+    n = jax.vmap(lambda x: normal(shape, x))(jnp.asarray(x))
+    np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, rtol=1e-12)
+    # One step of length φ against the normal ends on the surface.
+    outside = np.asarray(signed) > 0
+    foot = jnp.asarray(x) - signed[:, None] * n
+    back = jax.vmap(shape.signed_distance)(foot)
+    assert np.abs(back[outside]).max() < 1e-12
+    hollow = boundary.Complement(shape)
+    np.testing.assert_array_equal(jax.vmap(hollow.signed_distance)(jnp.asarray(x)), -signed)
+
+
+def test_normal_vanishes_where_there_is_none():
+    """In the centre of a sphere: no NaN, and its derivative has none either."""
+    shape = boundary.Sphere((0.0, 0.0), 1.0)
+    assert (normal(shape, jnp.zeros(2)) == 0).all()
+    assert jnp.isfinite(jax.jacfwd(lambda x: normal(shape, x))(jnp.zeros(2))).all()
+    body = boundary.Collider(shape, boundary.Slip(), boundary.Steady((1.0, 0.0)))
+    moved = body(jnp.zeros(2), jnp.asarray([0.3, 0.4]), T0)
+    np.testing.assert_allclose(moved, [1.0, 0.0])
+
+
+# --- Rotations and motions -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.2, 0.23, 1.0, 3.0, 6.0])
+def test_rotation_change_is_that_of_rodrigues(angle):
+    axis = np.array([0.48, -0.6, 0.64])
+    K = np.cross(np.eye(3), axis)
+    c, s = -2 * np.sin(angle / 2) ** 2, np.sin(angle)
+    expected = s * K - c * K @ K
+    got = rotation_change(jnp.asarray(angle * axis, jnp.zeros(()).dtype))
+    eps = float(jnp.finfo(got.dtype).eps)
+    np.testing.assert_allclose(got, expected, rtol=32 * eps, atol=8 * eps * angle**2)
+    reference = Rotation.from_rotvec(angle * axis).as_matrix() - np.eye(3)
+    np.testing.assert_allclose(got, reference, rtol=0, atol=8 * eps)
+    flat = rotation_change(jnp.asarray([angle], got.dtype))
+    np.testing.assert_allclose(flat, [[c, -s], [s, c]], rtol=32 * eps)
+
+
+@double
+def test_rotation_change_has_the_exact_derivative_at_rest():
+    jacobian = jax.jacfwd(rotation_change)(jnp.zeros(3))
+    expected = np.zeros((3, 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        expected[j, k, i], expected[k, j, i] = -1, 1
+    np.testing.assert_allclose(jacobian, expected)
+
+
+MOTIONS = {
+    "steady": boundary.Steady((0.2, -0.1, 0.3), (0.5, 1.0, -0.7), (0.1, 0.2, 0.3), 0.1, 0.9),
+    "key frames": boundary.KeyFrames(
+        (0.0, 0.4, 1.0),
+        [(0, 0, 0), (0.1, 0, 0.2), (0.1, 0.5, 0)],
+        [(0, 0, 0), (0.3, 0, 0), (0.3, 0.8, -0.2)],
+        (0.1, 0.0, 0.2),
+    ),
+    "steady 2-D": boundary.Steady((0.2, -0.1), 0.8, (0.1, 0.2)),
+    "key frames 2-D": boundary.KeyFrames((0.0, 1.0), [(0, 0), (0.1, 0.2)], [0.0, 1.5]),
+}
+
+
+@double
+@pytest.mark.parametrize("name", MOTIONS)
+def test_velocity_is_the_rate_of_the_place(name):
+    motion = MOTIONS[name]
+    d = motion.pivot.shape[0]
+    X = jnp.asarray(np.random.default_rng(1).normal(size=d))
+
+    def place(t):
+        return motion.rotation(t) @ (X - motion.pivot) + motion.pivot + motion.shift(t)
+
+    for t in (0.15, 0.31, 0.55, 0.85):
+        t = jnp.asarray(t)
+        x = place(t)
+        np.testing.assert_allclose(motion.to_rest(x, t), X, atol=1e-14)
+        rate = (place(t + 1e-6) - place(t - 1e-6)) / 2e-6
+        np.testing.assert_allclose(motion.velocity(x, t), rate, atol=1e-8)
+
+
+@double
+def test_motions_rest_outside_their_window():
+    steady, frames = MOTIONS["steady"], MOTIONS["key frames"]
+    x = jnp.asarray([1.0, 2.0, 3.0])
+    for motion, before, after in ((steady, 0.05, 0.95), (frames, -0.1, 1.2)):
+        for t in (before, after):
+            np.testing.assert_allclose(motion.velocity(x, jnp.asarray(t)), 0, atol=1e-15)
+        np.testing.assert_allclose(motion.to_rest(x, jnp.asarray(before)), x)
+    np.testing.assert_allclose(steady.shift(jnp.asarray(2.0)), 0.8 * steady.linear)
+    np.testing.assert_allclose(frames.shift(jnp.asarray(2.0)), frames.shifts[-1])
+    # At the start itself it moves already: the first step belongs to the window.
+    assert float(jnp.abs(steady.velocity(x, jnp.asarray(0.1))).max()) > 0.1
+
+
+@double
+@pytest.mark.parametrize("name", ["steady", "steady 2-D"])
+def test_steps_follow_a_steady_motion_to_rounding(name):
+    """200 steps of 4 ms along a circle: no drift, where v = ω × r would spiral out by 0.1 %."""
+    motion, dt = MOTIONS[name], jnp.asarray(0.004)
+    x = jnp.asarray([0.7, -0.3, 0.5][: motion.pivot.shape[0]])
+    start = 0.1
+    X = motion.to_rest(x, jnp.asarray(start))
+    for k in range(200):
+        v, _ = step_of(motion, x, jnp.asarray(start + 0.004 * k), dt)
+        x = x + dt * v
+    np.testing.assert_allclose(motion.to_rest(x, jnp.asarray(0.9)), X, atol=1e-13)
+
+
+def test_bad_motions_are_refused():
+    for make, words in (
+        (lambda: boundary.Steady((1.0, 0.0, 0.0), 2.0), "`angular_velocity` must be a vector of 3"),
+        (lambda: boundary.Steady((1.0,)), "`velocity` must be a vector of 2 or 3"),
+        (lambda: boundary.Steady((1.0, np.nan)), "`velocity` must be finite"),
+        (lambda: boundary.Steady((1.0, 0.0), start=1.0, end=0.5), "`end` must be after `start`"),
+        (lambda: boundary.KeyFrames((0.0,), [(0, 0)]), "`times` must be at least two increasing"),
+        (lambda: boundary.KeyFrames((0, 0), [(0, 0), (1, 0)]), "`times` must be at least two"),
+        (lambda: boundary.KeyFrames((0, 1), [(0, 0)]), "`shifts` must have shape"),
+        (lambda: boundary.KeyFrames((0, 1), np.zeros((2, 3)), np.zeros(2)), "`turns` must give"),
+        (lambda: boundary.Sphere((0, 0), 0.0), "`radius` must be positive"),
+        (lambda: boundary.Cuboid((0, 0), (1, -1)), "`half_size` must be positive"),
+        (lambda: boundary.Cylinder((0, 0), (1, 1), 1.0), "`start` must have shape"),
+        (lambda: boundary.Capsule((0, 0), (0, 0), 1.0), "`end` must differ from `start`"),
+        (lambda: boundary.SampledSDF((0, 0), 0.1, np.zeros((3, 2))), "`values` must have 2 axes"),
+        (lambda: boundary.SampledSDF((0, 0), 0.1, np.full((3, 3), np.nan)), "must be finite"),
+        (
+            lambda: boundary.Collider(boundary.Sphere((0, 0), 1.0), surface_velocity=1.0),
+            "`surface_velocity` must be a vector",
+        ),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()
+
+
+# --- Colliders -----------------------------------------------------------------------------------
+
+
+@double
+def test_contact_is_relative_to_the_moving_body():
+    """A node seen from a turning, moving body: the same contact as on the body at rest."""
+    shape = SHAPES_3D["cuboid"]
+    motion, t = MOTIONS["steady"], jnp.asarray(0.6)
+    contact = boundary.Separating(0.3)
+    rng = np.random.default_rng(3)
+    X = jnp.asarray(rng.uniform([-0.2, -0.3, -0.4], [0.4, 0.3, 0.2], (50, 3)))
+    V = jnp.asarray(rng.normal(size=(50, 3)))
+    R = motion.rotation(t)
+    for place, v in zip(X, V, strict=True):
+        x = R @ (place - motion.pivot) + motion.pivot + motion.shift(t)
+        wall = motion.velocity(x, t)
+        at_rest = boundary.Collider(shape, contact)(place, v, t)
+        moving = boundary.Collider(shape, contact, motion)(x, wall + R @ v, t)
+        np.testing.assert_allclose(moving, wall + R @ at_rest, atol=1e-13)
+
+
+def test_a_collider_exists_in_its_window_only():
+    body = boundary.Collider(boundary.Sphere((0, 0), 1.0), boundary.Sticky(), start=1.0, end=2.0)
+    v = jnp.asarray([0.5, 0.5])
+    for t, held in ((0.0, False), (1.0, True), (1.9, True), (2.0, False)):
+        got = body(jnp.asarray([0.1, 0.2]), v, jnp.asarray(t))
+        np.testing.assert_array_equal(got, 0 * v if held else v)
+
+
+@double
+def test_sampled_distances_reproduce_quadratic_functions():
+    """Spline coefficients are exact to second order, in value and normal; continued outside."""
+    rng = np.random.default_rng(4)
+    Q, b = rng.normal(size=(2, 2)), rng.normal(size=2)
+    Q = Q + Q.T
+
+    def f(x):
+        return x @ Q @ x / 2 + b @ x
+
+    nodes = np.stack(np.meshgrid(np.arange(9), np.arange(7), indexing="ij"), -1) * 0.25
+    values = jax.vmap(jax.vmap(f))(jnp.asarray(nodes))
+    shape = boundary.SampledSDF((0.0, 0.0), 0.25, values)
+    x = jnp.asarray(rng.uniform([0.7, 0.7], [1.3, 0.8], (20, 2)))
+    for point in x:
+        np.testing.assert_allclose(shape.signed_distance(point), f(point), atol=1e-13)
+        got = jax.grad(shape.signed_distance)(point)
+        np.testing.assert_allclose(got, Q @ point + b, atol=1e-12)
+    edge, out = jnp.asarray([1.875, 0.8]), jnp.asarray([2.875, 0.8])
+    gap = shape.signed_distance(out) - shape.signed_distance(edge)
+    np.testing.assert_allclose(gap, 1.0, rtol=1e-12)
+
+
+# --- Conditions of particles ---------------------------------------------------------------------
+
+
+def some(n=6, d=3, seed=0):
+    rng = np.random.default_rng(seed)
+    return Particles(
+        jnp.asarray(rng.normal(size=(n, d))),
+        jnp.asarray(rng.normal(size=(n, d))),
+        jnp.asarray(rng.normal(size=(n, d, d))),
+        jnp.asarray(rng.uniform(1, 2, n)),
+        jnp.zeros(n, bool),
+    )
+
+
+@double
+def test_led_particles_turn_rigidly_and_the_others_do_not():
+    p, dt, t = some(), jnp.asarray(1e-3), jnp.asarray(0.2)
+    mask = np.array([True, True, False, True, False, False])
+    motion = MOTIONS["steady"]
+    led = boundary.ParticleMotion(mask, motion)(p, t, dt)
+    np.testing.assert_array_equal(led.held, mask)
+    np.testing.assert_array_equal(led.v[~mask], p.v[~mask])
+    x = p.x + dt * led.v
+    apart = np.linalg.norm(x[0] - x[1])
+    np.testing.assert_allclose(apart, np.linalg.norm(p.x[0] - p.x[1]), rtol=1e-14)
+    exact = jax.vmap(lambda x: motion.velocity(x, t))(p.x)
+    np.testing.assert_allclose(led.v[mask], exact[mask], atol=2e-3)
+    # C is the gradient of that velocity: affine transfers see one rigid field.
+    np.testing.assert_allclose(led.C[0] @ (p.x[1] - p.x[0]), led.v[1] - led.v[0], rtol=1e-10)
+
+
+@double
+def test_a_particle_on_the_axis_only_turns():
+    p = some(1)._replace(x=jnp.asarray([[0.1, 0.2, 0.3]]))
+    motion = boundary.Steady((0, 0, 0), (0, 0, 2.0), (0.1, 0.2, 0.0))
+    led = boundary.ParticleMotion(np.ones(1, bool), motion)(p, T0, jnp.asarray(1e-3))
+    np.testing.assert_allclose(led.v, 0, atol=1e-15)
+
+
+@double
+def test_release_goes_along_the_direction():
+    x = np.array([[0.0, 1.0], [0.5, 0.0], [1.0, 3.0], [0.25, 0.0]])
+    times = boundary.release_times(x, (2.0, 0.0), start=1.0, end=3.0)
+    np.testing.assert_allclose(times, [1.0, 2.0, 3.0, 1.5])
+    layers = boundary.release_times(x, (1.0, 0.0), start=1.0, end=3.0, layers=2)
+    np.testing.assert_allclose(layers, [1.0, 3.0, 3.0, 1.0])
+    hold = boundary.ParticleMotion(np.ones(4, bool), boundary.Steady((0.0, 0.0)), end=times)
+    for t, held in ((0.9, [1, 1, 1, 1]), (1.2, [0, 1, 1, 1]), (2.5, [0, 0, 1, 0]), (3.0, [0] * 4)):
+        led = hold(some(4, 2), jnp.asarray(t), jnp.asarray(0.1))
+        np.testing.assert_array_equal(led.held, np.array(held, bool))
+    for arguments, words in (
+        ({"direction": (0.0, 0.0), "start": 0.0, "end": 1.0}, "`direction` must be a"),
+        ({"direction": (1.0, 0.0), "start": 1.0, "end": 1.0}, "`end` must be after `start`"),
+        (
+            {"direction": (1.0, 0.0), "start": 0.0, "end": 1.0, "layers": 1},
+            "`layers` must be",
+        ),
+    ):
+        with pytest.raises(ValueError, match=words):
+            boundary.release_times(x, **arguments)
+
+
+@double
+def test_force_gives_its_impulse_whatever_the_step():
+    """F (t₁ − t₀) in all, shared by mass, for windows that no step boundary meets."""
+    force = np.array([3.0, -1.0, 2.0])
+    mask = np.arange(6) < 4
+    push = boundary.ParticleForce(mask, force, start=0.0123, end=0.0777)
+    for dt in (0.01, 0.0007):
+        p = start = some()
+        for k in range(int(0.1 / dt) + 1):
+            p = push(p, jnp.asarray(k * dt), jnp.asarray(dt))
+        change = p.v - start.v
+        total = jnp.sum(p.mass[:, None] * change, axis=0)
+        np.testing.assert_allclose(total, (0.0777 - 0.0123) * force, rtol=1e-12)
+        np.testing.assert_allclose(change[0], change[3], rtol=1e-12)
+        assert (change[4:] == 0).all()
+
+
+@double
+@pytest.mark.parametrize(("rate", "quadratic"), [(2.0, 0.0), (0.0, 1.5), (2.0, 1.5), (0.0, 0.0)])
+def test_wind_is_integrated_exactly(rate, quadratic):
+    """One long step equals many short ones, and an ODE solver."""
+    from scipy.integrate import solve_ivp
+
+    u = np.array([1.0, 0.5, -0.2])
+    wind = boundary.Wind(u, rate, quadratic)
+    p, duration = some(), 0.7
+    once = wind(p, T0, jnp.asarray(duration)).v
+    often = p
+    for k in range(10):
+        often = wind(often, jnp.asarray(0.07 * k), jnp.asarray(0.07))
+    np.testing.assert_allclose(once, often.v, rtol=1e-12)
+
+    def rates(_, v):
+        w = v - u
+        return -(rate + quadratic * np.linalg.norm(w)) * w
+
+    exact = solve_ivp(rates, (0, duration), np.asarray(p.v[0]), rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(once[0], exact, rtol=1e-8)
+
+
+@double
+def test_wind_may_depend_on_place_and_time():
+    p = some()
+    field = boundary.Wind(lambda x, t: x * t, rate=1e9, mask=np.arange(6) < 3)
+    blown = field(p, jnp.asarray(2.0), jnp.asarray(1.0))
+    np.testing.assert_allclose(blown.v[:3], 2 * p.x[:3], rtol=1e-12)
+    np.testing.assert_array_equal(blown.v[3:], p.v[3:])
+
+
+def test_bad_conditions_of_particles_are_refused():
+    mask, rest = np.ones(3, bool), boundary.Steady((0.0, 0.0))
+    for make, words in (
+        (lambda: boundary.ParticleMotion(mask, rest, end=np.ones(4)), "`end` must be one number"),
+        (lambda: boundary.ParticleMotion(mask, rest, start=2.0, end=1.0), "`end` must be after"),
+        (lambda: boundary.ParticleForce(~mask, (1.0, 0.0)), "`mask` must select at least one"),
+        (lambda: boundary.ParticleForce(mask, 1.0), "`force` must be a vector"),
+        (lambda: boundary.ParticleImpulse(mask, (1.0, 0.0), duration=-1.0), "`duration` must be"),
+        (lambda: boundary.Wind((1.0, 0.0), rate=-1.0), "`rate` must be at least 0"),
+        (lambda: boundary.Wind((1.0, 0.0), mask=np.ones(3)), "`mask` must be a boolean"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()
