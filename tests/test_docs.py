@@ -36,7 +36,9 @@ def test_extend():
     assert all(slope != 0 for slope in names["slopes"])
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/conventions.md", "docs/design.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/conventions.md", "docs/design.md", "docs/scene-files.md"]
+)
 def test_links(page):
     path = ROOT / page
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 from scene_files import CAMERA, GRID, JELLY, MODEL, ball, planned, sphere, write
 
 from pgjax.render import save_ply
@@ -164,6 +165,24 @@ def test_values_per_gaussian_follow_the_particles(labelled):
     # And the simulator takes them.
     assert p.scene.masses.shape == (p.scene.particle_count,)
     assert 0 < p.dt < 1
+
+
+def test_values_skip_gaussians_that_are_broken(labelled):
+    """Files count the Gaussians of the model's file, those that cannot be used included."""
+    folder, capture, _ = labelled
+    file = PlyData.read(folder / "ball.ply", mmap=False)
+    file["vertex"]["x"][[4, 50, 51, 200]] = np.nan
+    file.write(folder / "ball.ply")
+    means = np.asarray(capture.means).copy()
+    means[[4, 50, 51, 200]] = np.nan
+    dense = JELLY.replace("1000", '{ file = "row.npy" }')
+    with pytest.warns(UserWarning, match="4 of the 300 Gaussians"):
+        p = planned(folder, MODEL, GRID, dense)
+    rows = (np.asarray(p.scene.materials[0].density) - 100).astype(int)
+    used = (np.asarray(capture.opacities) > 0.02) & np.isfinite(means[:, 0])
+    np.testing.assert_array_equal(rows, np.flatnonzero(used))
+    back = np.asarray(p.to_simulation.inverse().apply(p.moving.means))
+    np.testing.assert_allclose(back, means[rows], atol=1e-6)
 
 
 def test_values_are_carried_through_splitting(labelled):

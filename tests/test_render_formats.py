@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pgjax.render import load_gaussians, load_ply, save_ply
+from pgjax.render import load_capture, load_gaussians, load_ply, save_ply
 from pgjax.render.harmonics import basis
 
 HALF_TURN = np.array([1.0, -1.0, -1.0])
@@ -393,6 +393,12 @@ def test_broken_gaussians_are_left_out_and_counted(tmp_path):
         with pytest.warns(UserWarning, match=f"{left} of the {n} Gaussians in .*{name}"):
             gaussians = load_gaussians(path)
         assert len(gaussians) == n - left
+        with pytest.warns(UserWarning, match=f"{left} of the {n}"):
+            capture = load_capture(path)
+        assert capture.total == n
+        np.testing.assert_array_equal(capture.gaussians.means, gaussians.means)
+        if name == "a.splat":
+            np.testing.assert_array_equal(capture.rows, [0, 3])
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gaussians))
     with pytest.warns(UserWarning, match="2 of the 258"):
         load_ply(path)

@@ -11,6 +11,7 @@ from pgjax.render.gaussians import Similarity as Similarity
 from pgjax.render.gaussians import bound_stretch as bound_stretch
 from pgjax.render.gaussians import concatenate as concatenate
 from pgjax.render.gaussians import deform as deform
+from pgjax.render.load import load_capture as load_capture
 from pgjax.render.load import load_gaussians as load_gaussians
 from pgjax.render.media import VideoWriter as VideoWriter
 from pgjax.render.media import save_image as save_image
@@ -18,6 +19,7 @@ from pgjax.render.media import save_video as save_video
 from pgjax.render.needles import AxisReport as AxisReport
 from pgjax.render.needles import measure_axes as measure_axes
 from pgjax.render.needles import split_long as split_long
+from pgjax.render.ply import Capture as Capture
 from pgjax.render.ply import load_ply as load_ply
 from pgjax.render.ply import save_ply as save_ply
 from pgjax.render.rasterize import Image as Image

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pgjax.render.gaussians import Gaussians
-from pgjax.render.ply import existing_file, finite_gaussians, read_ply
+from pgjax.render.ply import Capture, existing_file, finite_gaussians, read_ply
 from pgjax.render.splat import read_splat
 from pgjax.render.spz import read_spz
 
@@ -30,9 +30,23 @@ def load_gaussians(path: str | os.PathLike[str]) -> Gaussians:
         ValueError: the file is missing, incomplete, of no known format, or holds nothing that can
             be drawn.
     """
+    return finite_gaussians(*_content(path)).gaussians
+
+
+def load_capture(path: str | os.PathLike[str]) -> Capture:
+    """The same as `load_gaussians`, and which Gaussians of the file they are.
+
+    For values that come beside a capture, one for each Gaussian of its file (labels of a
+    segmentation, say): `values[capture.rows]` are those of `capture.gaussians`.
+    """
+    return finite_gaussians(*_content(path))
+
+
+def _content(path: str | os.PathLike[str]) -> tuple[Path, list[np.ndarray]]:
+    """The file, and what its reader finds in it."""
     file = existing_file(path)
     read = _READERS.get(file.suffix.lower()) or _recognised(file)
-    return finite_gaussians(file, read(file))
+    return file, read(file)
 
 
 def _recognised(file: Path) -> Callable[[Path], list[np.ndarray]]:

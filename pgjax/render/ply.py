@@ -52,7 +52,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
             that can be drawn.
     """
     file = existing_file(path)
-    return finite_gaussians(file, read_ply(file))
+    return finite_gaussians(file, read_ply(file)).gaussians
 
 
 def existing_file(path: str | os.PathLike[str]) -> Path:
@@ -220,7 +220,21 @@ def _activated(vertex: np.ndarray, k: int) -> list[np.ndarray]:
         ]
 
 
-def finite_gaussians(file: Path, parts: list[np.ndarray]) -> Gaussians:
+class Capture(NamedTuple):
+    """The usable Gaussians of a file, n of them.
+
+    Attributes:
+        gaussians: in the order of the file.
+        rows: the number of each in the file, counted from 0, `(n,)`.
+        total: number of Gaussians in the file, those left out included.
+    """
+
+    gaussians: Gaussians
+    rows: np.ndarray
+    total: int
+
+
+def finite_gaussians(file: Path, parts: list[np.ndarray]) -> Capture:
     """The usable Gaussians of a file in the default precision; a warning counts the others.
 
     Args:
@@ -236,7 +250,8 @@ def finite_gaussians(file: Path, parts: list[np.ndarray]) -> Gaussians:
     for part in parts:
         good &= np.isfinite(part.reshape(n, -1)).all(axis=1)
     _report_left_out(file, n, int(np.count_nonzero(~good)))
-    return Gaussians.from_scales(*(jnp.asarray(part[good]) for part in parts))
+    usable = Gaussians.from_scales(*(jnp.asarray(part[good]) for part in parts))
+    return Capture(usable, np.flatnonzero(good), n)
 
 
 def _report_left_out(file: Path, n: int, broken: int) -> None:

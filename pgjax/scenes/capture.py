@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from pgjax.render import Gaussians, Similarity, load_gaussians, measure_axes, split_long
+from pgjax.render import Capture, Gaussians, Similarity, load_capture, measure_axes, split_long
 from pgjax.sampling import neighbour_volumes
 from pgjax.scenes.arrays import require_lengths
 from pgjax.scenes.interior import filled
@@ -49,11 +49,11 @@ def body(part: ModelPart, grid_spacing: float) -> Body:
 
 
 def _body(part: ModelPart, grid_spacing: float) -> Body:
-    gaussians = _load(part)
-    require_lengths(part.lengths, len(gaussians), part.source)
-    rows, moves = _select(part, gaussians)
-    similarity = _placing(part, np.asarray(gaussians.means, np.float64)[rows[moves]])
-    placed = gaussians[rows].transformed(similarity)
+    loaded = _load(part)
+    require_lengths(part.lengths, loaded.total, part.source)
+    gaussians, rows, moves = _select(part, loaded)
+    similarity = _placing(part, np.asarray(gaussians.means, np.float64)[moves])
+    placed = gaussians.transformed(similarity)
     moving, still, rows = placed[moves], placed[~moves & part.surroundings], rows[moves]
     notes = [_needles(moving, grid_spacing)]
     if part.split_longer_than is not None:
@@ -68,28 +68,30 @@ def _body(part: ModelPart, grid_spacing: float) -> Body:
         moving, volumes = inside.gaussians, inside.volumes
         rows = np.concatenate([rows, rows[inside.nearest]])
         notes.append(f"filling: {inside.report}")
-    return Body(moving, rows, volumes, still, len(gaussians), similarity, tuple(notes))
+    return Body(moving, rows, volumes, still, loaded.total, similarity, tuple(notes))
 
 
-def _load(part: ModelPart) -> Gaussians:
+def _load(part: ModelPart) -> Capture:
     if part.ply is not None:
-        return load_gaussians(part.ply)
+        return load_capture(part.ply)
     assert part.procedural is not None
-    return MODELS[part.procedural](part.seed)
+    made = MODELS[part.procedural](part.seed)
+    return Capture(made, np.arange(len(made)), len(made))
 
 
-def _select(part: ModelPart, gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Which Gaussians are opaque enough to be there, and which of those are simulated."""
-    rows = np.flatnonzero(np.asarray(gaussians.opacities) > part.opacity_above)
+def _select(part: ModelPart, loaded: Capture) -> tuple[Gaussians, np.ndarray, np.ndarray]:
+    """The Gaussians that are opaque enough to be there, their rows, and which are simulated."""
+    opaque = np.asarray(loaded.gaussians.opacities) > part.opacity_above
+    gaussians, rows = loaded.gaussians[opaque], loaded.rows[opaque]
     moves = np.ones(len(rows), bool)
     if part.region is not None:
-        moves = part.region.contains(Points(np.asarray(gaussians.means, np.float64)[rows], rows))
+        moves = part.region.contains(Points(np.asarray(gaussians.means, np.float64), rows))
     if not moves.any():
         raise SceneError(
-            f"{part.label}: no Gaussian of {len(gaussians)} is left to simulate: {len(rows)} are "
+            f"{part.label}: no Gaussian of {loaded.total} is left to simulate: {len(rows)} are "
             f"above the opacity {part.opacity_above:g}, none of them in the region."
         )
-    return rows, moves
+    return gaussians, rows, moves
 
 
 def _placing(part: ModelPart, x: np.ndarray) -> Similarity:
