@@ -7,7 +7,9 @@ isotropic *function*, and that is smooth: `spectral_map` (of a symmetric matrix)
 forward and reverse.
 """
 
+import functools
 import math
+import operator
 from collections.abc import Callable
 
 import jax
@@ -273,6 +275,13 @@ def cofactor(A: Matrix3) -> Matrix3:
 def deviator(A: Matrix3) -> Matrix3:
     """`A − tr(A)/3 I`."""
     return A - (jnp.trace(A) / 3) * jnp.eye(3, dtype=A.dtype)
+
+
+def apply(A: Float[Array, "d d"], x: Float[Array, " d"]) -> Float[Array, " d"]:
+    """`A x`, written out: under `vmap` over x XLA makes vector code of it instead of calls."""
+    d = x.shape[0]
+    rows = [[A[i, j] * x[j] for j in range(d)] for i in range(d)]
+    return jnp.stack([functools.reduce(operator.add, row) for row in rows])
 
 
 def rotation_change(turn: Float[Array, " k"]) -> Array:

@@ -166,9 +166,9 @@ def test_velocity_is_the_rate_of_the_place(name):
     for t in (0.15, 0.31, 0.55, 0.85):
         t = jnp.asarray(t)
         x = place(t)
-        np.testing.assert_allclose(motion.to_rest(x, t), X, atol=1e-14)
+        np.testing.assert_allclose(motion.at(t).to_rest(x), X, atol=1e-14)
         rate = (place(t + 1e-6) - place(t - 1e-6)) / 2e-6
-        np.testing.assert_allclose(motion.velocity(x, t), rate, atol=1e-8)
+        np.testing.assert_allclose(motion.at(t).velocity_at(x), rate, atol=1e-8)
 
 
 @double
@@ -177,12 +177,12 @@ def test_motions_rest_outside_their_window():
     x = jnp.asarray([1.0, 2.0, 3.0])
     for motion, before, after in ((steady, 0.05, 0.95), (frames, -0.1, 1.2)):
         for t in (before, after):
-            np.testing.assert_allclose(motion.velocity(x, jnp.asarray(t)), 0, atol=1e-15)
-        np.testing.assert_allclose(motion.to_rest(x, jnp.asarray(before)), x)
+            np.testing.assert_allclose(motion.at(jnp.asarray(t)).velocity_at(x), 0, atol=1e-15)
+        np.testing.assert_allclose(motion.at(jnp.asarray(before)).to_rest(x), x)
     np.testing.assert_allclose(steady.shift(jnp.asarray(2.0)), 0.8 * steady.linear)
     np.testing.assert_allclose(frames.shift(jnp.asarray(2.0)), frames.shifts[-1])
     # At the start itself it moves already: the first step belongs to the window.
-    assert float(jnp.abs(steady.velocity(x, jnp.asarray(0.1))).max()) > 0.1
+    assert float(jnp.abs(steady.at(jnp.asarray(0.1)).velocity_at(x)).max()) > 0.1
 
 
 @double
@@ -192,11 +192,11 @@ def test_steps_follow_a_steady_motion_to_rounding(name):
     motion, dt = MOTIONS[name], jnp.asarray(0.004)
     x = jnp.asarray([0.7, -0.3, 0.5][: motion.pivot.shape[0]])
     start = 0.1
-    X = motion.to_rest(x, jnp.asarray(start))
+    X = motion.at(jnp.asarray(start)).to_rest(x)
     for k in range(200):
         v, _ = step_of(motion, x, jnp.asarray(start + 0.004 * k), dt)
         x = x + dt * v
-    np.testing.assert_allclose(motion.to_rest(x, jnp.asarray(0.9)), X, atol=1e-13)
+    np.testing.assert_allclose(motion.at(jnp.asarray(0.9)).to_rest(x), X, atol=1e-13)
 
 
 def test_bad_motions_are_refused():
@@ -239,7 +239,7 @@ def test_contact_is_relative_to_the_moving_body():
     R = motion.rotation(t)
     for place, v in zip(X, V, strict=True):
         x = R @ (place - motion.pivot) + motion.pivot + motion.shift(t)
-        wall = motion.velocity(x, t)
+        wall = motion.at(t).velocity_at(x)
         at_rest = boundary.Collider(shape, contact)(place, v, t)
         moving = boundary.Collider(shape, contact, motion)(x, wall + R @ v, t)
         np.testing.assert_allclose(moving, wall + R @ at_rest, atol=1e-13)
@@ -301,7 +301,7 @@ def test_led_particles_turn_rigidly_and_the_others_do_not():
     x = p.x + dt * led.v
     apart = np.linalg.norm(x[0] - x[1])
     np.testing.assert_allclose(apart, np.linalg.norm(p.x[0] - p.x[1]), rtol=1e-14)
-    exact = jax.vmap(lambda x: motion.velocity(x, t))(p.x)
+    exact = jax.vmap(lambda x: motion.at(t).velocity_at(x))(p.x)
     np.testing.assert_allclose(led.v[mask], exact[mask], atol=2e-3)
     # C is the gradient of that velocity: affine transfers see one rigid field.
     np.testing.assert_allclose(led.C[0] @ (p.x[1] - p.x[0]), led.v[1] - led.v[0], rtol=1e-10)

@@ -1,5 +1,6 @@
 """Runs that are stopped go on as if they had not been; what a run would do is said before."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -477,15 +478,25 @@ sys.exit(pgjax.cli.main(sys.argv[1:]))
 """
 
 
+@contextlib.contextmanager
 def started(folder, out):
-    """The command in a process of its own."""
+    """The command in a process of its own, once its run is at frame 1, and what it says."""
     arguments = ["run", str(folder / "drop.toml"), "--save-ply", "--save-trajectory"]
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *arguments, "--out", str(out)],
-        env=os.environ | {"JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64))},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    environment = os.environ | {"JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64))}
+    # A pipe that nobody reads would stop a process that says much.
+    with (out.parent / "stderr").open("w+") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, *arguments, "--out", str(out)],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+        )
+        try:
+            wait_for_frame(process, out, 1)
+            yield process, said
+        finally:
+            process.kill()
+            process.wait()
 
 
 def wait_for_frame(process, out, frame):
@@ -493,28 +504,27 @@ def wait_for_frame(process, out, frame):
         record = unfinished(out)
         if record is not None and record.frame >= frame:
             return
-        assert process.poll() is None, process.stderr.read()
+        assert process.poll() is None, (out.parent / "stderr").read_text()
         time.sleep(0.02)
     raise AssertionError("the run did not come to its first frames")
 
 
 def test_a_killed_process(folder, whole, tmp_path):
-    process = started(folder, tmp_path / "out")
-    wait_for_frame(process, tmp_path / "out", 1)
-    process.kill()
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
+    with started(folder, tmp_path / "out") as (process, _):
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
     assert unfinished(tmp_path / "out").frame >= 1
     assert cli.main(["run", str(folder / "drop.toml"), "--out", f"{tmp_path}/out", "--resume"]) == 0
     assert_same_run(tmp_path / "out", whole)
 
 
 def test_ctrl_c(folder, whole, tmp_path):
-    process = started(folder, tmp_path / "out")
-    wait_for_frame(process, tmp_path / "out", 0)
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=120)
-    assert process.returncode == 130, error
+    with started(folder, tmp_path / "out") as (process, said):
+        process.send_signal(signal.SIGINT)
+        status = process.wait(timeout=120)
+        said.seek(0)
+        error = said.read()
+    assert status == 130, error
     last = error.splitlines()[-1]
     assert last.startswith("pgjax: interrupted; go on with: pgjax run ")
     assert last.endswith("--resume")

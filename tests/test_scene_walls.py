@@ -54,7 +54,7 @@ WALLS = {
         Complement(BALL)
     ),
     'type = "cuboid"\ncenter = [0, 0, 0]\nhalf_size = [1, 2, 3]': Collider(
-        Cuboid((0.0, 0, 0), (1.0, 2, 3), (0.0, 0, 0))
+        Cuboid((0.0, 0, 0), (1.0, 2, 3))
     ),
     'type = "cuboid"\ncenter = [0, 0, 0]\nhalf_size = [1, 2, 3]\nrotation = 30': Collider(
         Cuboid((0.0, 0, 0), (1.0, 2, 3), (0.0, 0, 30 * DEGREE))

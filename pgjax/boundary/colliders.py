@@ -5,6 +5,7 @@ nodes on a wall and everything behind it are held, wherever the grid lies.
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -87,19 +88,30 @@ class Collider(AbstractGridCondition):
 
     def __call__(self, x: Vector, v: Vector, t: Scalar) -> Vector:
         """Apply the contact on the body and inside it."""
-        at_rest = x if self.motion is None else self.motion.to_rest(x, t)
-        n = self._turned(normal(self.shape, at_rest), t)
-        wall = jnp.zeros_like(v) if self.motion is None else self.motion.velocity(x, t)
+        if self.motion is None:
+            wall = jnp.zeros_like(v) if self.surface_velocity is None else self.surface_velocity
+            return self._touched(x, x, v, t, wall, lambda n: n)
+        pose = self.motion.at(t)
+        wall = pose.velocity_at(x)
         if self.surface_velocity is not None:
-            wall = wall + self._turned(self.surface_velocity, t)
+            wall = wall + pose.turned(self.surface_velocity)
+        return self._touched(x, pose.to_rest(x), v, t, wall, pose.turned)
+
+    def _touched(
+        self,
+        x: Vector,
+        at_rest: Vector,
+        v: Vector,
+        t: Scalar,
+        wall: Vector,
+        turned: Callable[[Vector], Vector],
+    ) -> Vector:
+        n = turned(normal(self.shape, at_rest))
         inside = self.shape.signed_distance(at_rest) <= _tolerance(x, at_rest)
         active = (t >= self.start) & (t < self.end)
         # Without a normal (in the centre of a sphere) the material moves with the body.
         contact = jnp.where(jnp.any(n != 0), self.contact(v - wall, n), Sticky()(v, n))
         return jnp.where(inside & active, wall + contact, v)
-
-    def _turned(self, vector: Vector, t: Scalar) -> Vector:
-        return vector if self.motion is None else self.motion.rotation(t) @ vector
 
 
 @final

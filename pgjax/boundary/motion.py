@@ -1,7 +1,7 @@
 """Prescribed rigid motion: of a collider, or of particles that are led."""
 
 import abc
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -19,11 +19,41 @@ from pgjax._types import (
     require_like,
     require_vector,
 )
-from pgjax.linalg import rotation_change
+from pgjax.linalg import apply, rotation_change
 
 Vector = Float[Array, " d"]
 Matrix = Float[Array, "d d"]
 Turn = Float[Array, " k"]
+
+
+class Pose(NamedTuple):
+    """Where a rigid body is at one instant, and how fast.
+
+    Attributes:
+        pivot: at rest, m, `(d,)`.
+        center: the pivot now, m, `(d,)`.
+        R: rotation since rest, `(d, d)`.
+        velocity: of the pivot, m/s, `(d,)`.
+        W: spin `Ṙ Rᵀ`, 1/s, `(d, d)`.
+    """
+
+    pivot: Vector
+    center: Vector
+    R: Matrix
+    velocity: Vector
+    W: Matrix
+
+    def to_rest(self, x: Vector) -> Vector:
+        """Where the point of the body that is at x now is at rest."""
+        return apply(self.R.T, x - self.center) + self.pivot
+
+    def turned(self, vector: Vector) -> Vector:
+        """A vector of the body at rest as it is now."""
+        return apply(self.R, vector)
+
+    def velocity_at(self, x: Vector) -> Vector:
+        """Velocity of the body at x, m/s."""
+        return apply(self.W, x - self.center) + self.velocity
 
 
 class AbstractMotion(eqx.Module):
@@ -49,21 +79,17 @@ class AbstractMotion(eqx.Module):
         change = rotation_change(self.turn(t))
         return change + jnp.eye(change.shape[0], dtype=change.dtype)
 
-    def to_rest(self, x: Vector, t: Scalar) -> Vector:
-        """Where the point of the body that is at x at time t is at rest."""
-        return self.rotation(t).T @ (x - self.pivot - self.shift(t)) + self.pivot
+    def at(self, t: Scalar) -> Pose:
+        """Place and rates of the body at time t."""
 
-    def rates(self, t: Scalar) -> tuple[Vector, Matrix]:
-        """Velocity of the pivot, m/s, and spin `W = Ṙ Rᵀ`, 1/s."""
-        one = jnp.ones_like(t)
-        (_, R), (shift, dR) = jax.jvp(lambda t: (self.shift(t), self.rotation(t)), (t,), (one,))
+        def place(t: Scalar) -> tuple[Vector, Matrix]:
+            return self.pivot + self.shift(t), self.rotation(t)
+
+        (center, R), (rate, dR) = jax.jvp(place, (t,), (jnp.ones_like(t),))
         W = dR @ R.T
-        return shift, (W - W.T) / 2
-
-    def velocity(self, x: Vector, t: Scalar) -> Vector:
-        """Velocity of the body at x, m/s."""
-        shift, W = self.rates(t)
-        return W @ (x - self.pivot - self.shift(t)) + shift
+        # Behind a barrier, so that the compiler does not compute them anew at each node.
+        pose = jax.lax.optimization_barrier((center, R, rate, (W - W.T) / 2))
+        return Pose(self.pivot, *pose)
 
 
 @final
@@ -192,10 +218,11 @@ def step_of(motion: AbstractMotion, x: Vector, t: Scalar, dt: Scalar) -> tuple[V
     The rates of the middle of the step, turned through exactly: a steady motion is followed to
     rounding, any other to second order in dt.
     """
-    shift, W = motion.rates(t + dt / 2)
+    middle = motion.at(t + dt / 2)
+    W = middle.W
     w = W[1, :1] if x.shape[0] == 2 else jnp.stack([W[2, 1], W[0, 2], W[1, 0]])
     chord = rotation_change(dt * w) / dt
-    return chord @ (x - motion.pivot - motion.shift(t)) + shift, chord
+    return apply(chord, x - motion.pivot - motion.shift(t)) + middle.velocity, chord
 
 
 def turn_like(angular: Any, linear: Array) -> Array:

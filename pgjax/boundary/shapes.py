@@ -26,7 +26,7 @@ from pgjax._types import (
     require_vector,
 )
 from pgjax.boundary.motion import require_turn, turn_like
-from pgjax.linalg import rotation_change
+from pgjax.linalg import apply, rotation_change
 from pgjax.splines import BSpline
 
 Vector = Float[Array, " d"]
@@ -90,28 +90,32 @@ class Cuboid(AbstractShape):
     Args:
         center: m.
         half_size: half its extents before it is turned, m.
-        turn: rotation vector about the centre, rad, `(3,)`; an angle in two dimensions.
+        turn: rotation vector about the centre, rad, `(3,)`; an angle in two dimensions. None if
+            it is not turned.
     """
 
     center: Array
     half_size: Array
-    turn: Array
+    turn: Array | None
 
     def __init__(self, center: Any, half_size: Any, turn: Any = None):
         self.center = as_float_array(center)
         self.half_size = as_float_array(half_size)
-        self.turn = turn_like(turn, self.center)
+        self.turn = None if turn is None else turn_like(turn, self.center)
 
     def __check_init__(self):
         require_vector("center", self.center)
         require_like("half_size", self.half_size, "center", self.center)
         require("half_size", self.half_size, "be positive (m)", lambda a: a > 0)
-        require_turn("turn", self.turn, self.center)
+        if self.turn is not None:
+            require_turn("turn", self.turn, self.center)
 
     def signed_distance(self, x: Vector) -> Scalar:
         """Distance to the nearest face, edge or corner."""
         r = x - self.center
-        return _outside_and_inside(jnp.abs(r + rotation_change(-self.turn) @ r) - self.half_size)
+        if self.turn is not None:
+            r = r + apply(rotation_change(-self.turn), r)
+        return _outside_and_inside(jnp.abs(r) - self.half_size)
 
 
 @final

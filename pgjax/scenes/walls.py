@@ -142,7 +142,9 @@ def _sphere(t: Table) -> Callable[[Site], _Body]:
 
 def _cuboid(t: Table) -> Callable[[Site], _Body]:
     center, half_size = t.vector("center"), t.vector("half_size", above=0)
-    return _known(Cuboid(center, half_size, rotation_vector(rotation(t))), center)
+    turned = rotation(t)
+    turn = rotation_vector(turned) if t.has("rotation") else None
+    return _known(Cuboid(center, half_size, turn), center)
 
 
 def _along(shape: Callable[..., AbstractShape]) -> Callable[[Table], Callable[[Site], _Body]]:
