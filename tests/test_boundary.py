@@ -205,6 +205,7 @@ def test_bad_motions_are_refused():
         (lambda: boundary.Steady((1.0,)), "`velocity` must be a vector of 2 or 3"),
         (lambda: boundary.Steady((1.0, np.nan)), "`velocity` must be finite"),
         (lambda: boundary.Steady((1.0, 0.0), start=1.0, end=0.5), "`end` must be after `start`"),
+        (lambda: boundary.Steady((1.0, 0.0), start=-np.inf), "`start` must be finite"),
         (lambda: boundary.KeyFrames((0.0,), [(0, 0)]), "`times` must be at least two increasing"),
         (lambda: boundary.KeyFrames((0, 0), [(0, 0), (1, 0)]), "`times` must be at least two"),
         (lambda: boundary.KeyFrames((0, 1), [(0, 0)]), "`shifts` must have shape"),
@@ -305,6 +306,24 @@ def test_led_particles_turn_rigidly_and_the_others_do_not():
     np.testing.assert_allclose(led.v[mask], exact[mask], atol=2e-3)
     # C is the gradient of that velocity: affine transfers see one rigid field.
     np.testing.assert_allclose(led.C[0] @ (p.x[1] - p.x[0]), led.v[1] - led.v[0], rtol=1e-10)
+
+
+@double
+def test_windows_without_end_lead_from_the_beginning():
+    """Open windows put no ∞ into velocities or derivatives."""
+    lead = boundary.ParticleMotion(
+        np.ones(6, bool), boundary.Steady((0.3, 0, 0), (0, 0, 1.0)), -np.inf, np.inf
+    )
+
+    def speed(v):
+        motion = boundary.Steady(jnp.stack([v, 0 * v, 0 * v]))
+        return boundary.ParticleMotion(lead.mask, motion, -np.inf)(some(), T0, T0 + 0.1).v[0, 0]
+
+    led = lead(some(), T0, jnp.asarray(1e-3))
+    assert bool(led.held.all())
+    assert bool(jnp.isfinite(led.v).all())
+    value, slope = jax.value_and_grad(speed)(jnp.asarray(0.3))
+    np.testing.assert_allclose((value, slope), (0.3, 1.0), rtol=1e-12)
 
 
 @double

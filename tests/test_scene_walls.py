@@ -155,7 +155,7 @@ LEAD = {
     'type = "hold"': lambda m, _: ParticleMotion(m, Steady((0.0, 0, 0)), -np.inf, np.inf),
     'type = "hold"\nend = 0.5': lambda m, _: ParticleMotion(m, Steady((0.0, 0, 0)), -np.inf, 0.5),
     'type = "velocity"\nvelocity = [1, 0, 0]\nstart = 0\nend = 2': lambda m, _: ParticleMotion(
-        m, Steady((1.0, 0, 0), start=-np.inf), 0.0, 2.0
+        m, Steady((1.0, 0, 0)), 0.0, 2.0
     ),
     'type = "move"\nmotion = { angular_velocity = [0, 0, 90] }\nstart = 1': (
         lambda m, x: ParticleMotion(
@@ -220,6 +220,17 @@ def test_a_scene_with_walls_and_conditions_runs(tmp_path):
     moved = simulate(p.scene, p.state, dt=p.dt, frames=2, substeps=p.substeps).final
     assert bool(moved.status.ok)
     assert float(np.asarray(moved.x - p.state.x)[:, 0].mean()) > 0.005
+
+
+def test_every_condition_of_particles_runs(tmp_path):
+    """All at once, windows open as they are by default: nothing becomes NaN, the last one leads."""
+    conditions = [f"[[particles]]\n{text}" for text in LEAD if not text.endswith("end = 0.5")]
+    lead = '[[particles]]\ntype = "velocity"\nvelocity = [0.5, 0, 0]'
+    p = planned(tmp_path, MODEL, GRID, JELLY, *conditions, lead)
+    moved = simulate(p.scene, p.state, dt=p.dt, frames=1, substeps=4).final
+    assert bool(moved.status.ok)
+    way = np.asarray(moved.x - p.state.x)
+    np.testing.assert_allclose(way, np.tile([2.0 * p.dt, 0, 0], (len(way), 1)), atol=1e-9)
 
 
 FAULTS = [

@@ -131,6 +131,8 @@ class Steady(AbstractMotion):
         require_vector("velocity", self.linear)
         require_like("pivot", self.pivot, "velocity", self.linear)
         require_turn("angular_velocity", self.angular, self.linear)
+        # From −∞ on it would be infinitely far by now.
+        require("start", self.start, "be finite (s)", np.isfinite)
         require_window(self.start, self.end)
 
     def _elapsed(self, t: Scalar) -> Scalar:

@@ -54,7 +54,7 @@ def _move(t: Table) -> Make:
 def _velocity(t: Table) -> Make:
     """A motion with one velocity, in short."""
     velocity, times = t.vector("velocity"), window(t)
-    return lambda mask, _: ParticleMotion(mask, Steady(velocity, start=-math.inf), **times)
+    return lambda mask, _: ParticleMotion(mask, Steady(velocity), **times)
 
 
 def _impulse(t: Table) -> Make:
