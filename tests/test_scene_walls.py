@@ -230,7 +230,8 @@ def test_every_condition_of_particles_runs(tmp_path):
     moved = simulate(p.scene, p.state, dt=p.dt, frames=1, substeps=4).final
     assert bool(moved.status.ok)
     way = np.asarray(moved.x - p.state.x)
-    np.testing.assert_allclose(way, np.tile([2.0 * p.dt, 0, 0], (len(way), 1)), atol=1e-9)
+    # Single precision resolves positions of half a metre to 6e-8.
+    np.testing.assert_allclose(way, np.tile([2.0 * p.dt, 0, 0], (len(way), 1)), atol=5e-7)
 
 
 FAULTS = [
