@@ -57,7 +57,13 @@ def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Arr
     x = _where(state.alive & _finite(state.position), state.x, 0)
     particles = Particles(x, v, state.C, mass, jnp.zeros_like(state.alive))
     for condition in scene.particle_conditions:
-        particles = condition(particles, t, dt)
+        before, particles = particles, condition(particles, t, dt)
+        # What is led already stays so, whatever comes later in the list.
+        particles = particles._replace(
+            v=_where(before.held, before.v, particles.v),
+            C=_where(before.held, before.C, particles.C),
+            held=before.held | particles.held,
+        )
     v, C = particles.v, particles.C
     return particles.held, eqx.tree_at(lambda s: (s.v, s.C), state, (v, C))
 

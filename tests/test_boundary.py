@@ -12,6 +12,7 @@ from pgjax.boundary.motion import step_of
 from pgjax.boundary.particles import Particles
 from pgjax.boundary.shapes import normal
 from pgjax.linalg import rotation_change
+from pgjax.models.material import cast
 
 double = pytest.mark.float64
 T0 = jnp.asarray(0.0)
@@ -419,3 +420,26 @@ def test_bad_conditions_of_particles_are_refused():
     ):
         with pytest.raises(ValueError, match=words):
             make()
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1, 0.25, 0.5, 1.0, 1.5])
+def test_a_sudden_push_is_given_once_in_either_precision(start):
+    """Steps that fall on its start up to rounding: the momentum is neither lost nor doubled."""
+    push = boundary.ParticleImpulse(np.ones(1, bool), (1.0, 0, 0), start)
+    push = cast(push, jnp.float32)
+    for fps, substeps in ((24, 5), (24, 20), (24, 10), (25, 10), (30, 7)):
+        dt = jnp.asarray(1 / fps / substeps, jnp.float32)
+        n = int((start + 0.1) * fps * substeps) + 2
+        zero = jnp.zeros((1, 3), jnp.float32)
+        given = jnp.zeros((), jnp.float32)
+        p = Particles(zero, zero, jnp.zeros((1, 3, 3), jnp.float32), zero[:, 0] + 1, zero[:, 0] > 0)
+        for k in range(max(n - 40 - int(0.1 * fps * substeps), 0), n):
+            given += push(p, jnp.asarray(k, jnp.float32) * dt, dt).v[0, 0]
+        np.testing.assert_allclose(given, 1, rtol=1e-3)
+
+
+def test_forces_keep_their_size_late_in_single_precision():
+    force = cast(boundary.ParticleForce(np.ones(1, bool), (1.0, 0, 0)), jnp.float32)
+    zero, dt = jnp.zeros((1, 3), jnp.float32), jnp.float32(1e-5)
+    p = Particles(zero, zero, jnp.zeros((1, 3, 3), jnp.float32), zero[:, 0] + 1, zero[:, 0] > 0)
+    np.testing.assert_allclose(force(p, jnp.float32(20.0), dt).v[0, 0], 1e-5, rtol=1e-6)

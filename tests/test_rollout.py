@@ -12,11 +12,13 @@ from pgjax.boundary import (
     Collider,
     Cuboid,
     HalfSpace,
+    ParticleForce,
     ParticleImpulse,
     ParticleMotion,
     Separating,
     Steady,
     Sticky,
+    Wind,
 )
 from pgjax.simulate import checkpointed_scan
 
@@ -348,6 +350,16 @@ def test_led_particles_follow_exactly(measure):
     assert not np.allclose(before.v[held], value)
     after = run(scene, during, 5)
     assert not np.allclose(after.v[held], value)
+
+
+@pytest.mark.float64
+def test_what_is_held_is_not_pushed():
+    """Forces and wind that come after a hold in the list do not move what it holds."""
+    every = np.ones(9, bool)
+    hold = ParticleMotion(every, Steady([0.0, 0.0]))
+    for push in (Wind([1.5, 0.0], 2.0), ParticleForce(every, [1.0, 0.0])):
+        scene, state = one_body(particle_conditions=(hold, push))
+        np.testing.assert_array_equal(run(scene, state, 5).x, state.x)
 
 
 @pytest.mark.float64

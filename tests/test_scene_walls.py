@@ -223,10 +223,10 @@ def test_a_scene_with_walls_and_conditions_runs(tmp_path):
 
 
 def test_every_condition_of_particles_runs(tmp_path):
-    """All at once, windows open as they are by default: nothing becomes NaN, the last one leads."""
+    """All at once, windows open as they are by default: no NaN, and the first leads."""
     conditions = [f"[[particles]]\n{text}" for text in LEAD if not text.endswith("end = 0.5")]
     lead = '[[particles]]\ntype = "velocity"\nvelocity = [0.5, 0, 0]'
-    p = planned(tmp_path, MODEL, GRID, JELLY, *conditions, lead)
+    p = planned(tmp_path, MODEL, GRID, JELLY, lead, *conditions)
     moved = simulate(p.scene, p.state, dt=p.dt, frames=1, substeps=4).final
     assert bool(moved.status.ok)
     way = np.asarray(moved.x - p.state.x)

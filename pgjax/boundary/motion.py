@@ -96,7 +96,7 @@ class AbstractMotion(eqx.Module):
 class Steady(AbstractMotion):
     """Constant velocity and angular velocity in a time window, at rest before and after it.
 
-    A body that turned stays turned. `Steady(0)` is a body at rest.
+    A body that turned stays turned. `Steady((0, 0, 0))` is a body at rest.
 
     Args:
         velocity: of the pivot, m/s, `(d,)`.

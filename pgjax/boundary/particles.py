@@ -74,7 +74,7 @@ class ParticleMotion(AbstractParticleCondition):
 
     mask: Array = eqx.field(converter=jnp.asarray)
     motion: AbstractMotion
-    start: Array = eqx.field(default=0.0, converter=as_float_array)
+    start: Array = eqx.field(default=-float("inf"), converter=as_float_array)
     end: Array = eqx.field(default=float("inf"), converter=as_float_array)
 
     def __check_init__(self):
@@ -142,7 +142,7 @@ class ParticleImpulse(AbstractParticleCondition):
         mask: which particles, boolean `(p,)`.
         momentum: total momentum given, kg·m/s; shared in proportion to mass.
         start: when the push starts, s.
-        duration: how long it lasts, s; 0 gives all of it in one step.
+        duration: how long it lasts, s; at least one step is taken.
     """
 
     mask: Array = eqx.field(converter=jnp.asarray)
@@ -157,12 +157,9 @@ class ParticleImpulse(AbstractParticleCondition):
 
     def __call__(self, particles: Particles, t: Scalar, dt: Scalar) -> Particles:
         """`v + P f/M` with f the part of the push that falls into this step."""
-        lasting = self.duration > 0
-        during = _overlap(t, dt, self.start, self.start + self.duration)
-        sudden = (t <= self.start) & (self.start < t + dt)
-        part = jnp.where(
-            lasting, during / jnp.where(lasting, self.duration, 1), sudden.astype(t.dtype)
-        )
+        # A sudden push lasts one step: shared by two where it starts between them.
+        lasting = jnp.maximum(self.duration, dt)
+        part = _overlap(t, dt, self.start, self.start + lasting) / lasting
         return _pushed(particles, self.mask, part * self.momentum)
 
 
@@ -266,7 +263,8 @@ class Wind(AbstractParticleCondition):
 
 def _overlap(t: Scalar, dt: Scalar, start: Array, end: Array) -> Scalar:
     """How much of the step from t to t + dt lies in a window, s."""
-    return jnp.maximum(jnp.minimum(t + dt, end) - jnp.maximum(t, start), 0)
+    # Differences from t first: t + dt would lose the digits of dt late in a float32 run.
+    return jnp.maximum(jnp.minimum(dt, end - t) - jnp.maximum(start - t, 0), 0)
 
 
 def _pushed(particles: Particles, mask: Array, momentum: Float[Array, " d"]) -> Particles:
