@@ -36,6 +36,18 @@ def pytest_collection_modifyitems(items):
                 item.add_marker(pytest.mark.skip(reason="needs double precision"))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def release_compiled_programs():
+    """Forget, after each file, what its tests compiled.
+
+    Every program XLA compiles for the CPU keeps some thirty memory mappings. A process may have
+    65 530 on Linux; a whole suite's worth of programs exceeds that, and the compiler then dies
+    of a segmentation fault. Large programs come back from the compilation cache on disk.
+    """
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def reference_data() -> pathlib.Path:
     """The folder of captured scenes and reference renders, which is not part of the project."""
