@@ -29,6 +29,7 @@ __all__ = [
     "positive",
     "require",
     "require_like",
+    "require_number",
     "require_vector",
 ]
 
@@ -91,6 +92,12 @@ def positive(a: Any) -> Any:
 def nonnegative(a: Any) -> Any:
     """Whether a number is at least 0 and finite."""
     return (a >= 0) & (a < float("inf"))
+
+
+def require_number(name: str, value: Array) -> None:
+    """Refuse what is not one number."""
+    if value.shape != ():
+        raise ValueError(f"Argument `{name}` must be one number, but has shape {value.shape}.")
 
 
 def require_vector(name: str, value: Array) -> None:

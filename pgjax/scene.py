@@ -1,5 +1,6 @@
 """Everything that is constant in time."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, final
 
@@ -18,9 +19,10 @@ from pgjax._types import (
     positive,
     require,
 )
+from pgjax.boundary import Particles
 from pgjax.grid import Grid
 from pgjax.models import Material
-from pgjax.models.material import particle_axes
+from pgjax.models.material import cast, particle_axes
 from pgjax.result import Status
 from pgjax.splines import BSpline
 from pgjax.state import State
@@ -40,7 +42,8 @@ class Scene(eqx.Module):
         gravity: m/s², `(d,)`; zero by default.
         boundaries: conditions of the grid, `(x, v, t) -> v` for one node, applied in order.
         particle_conditions: prescribed motion, forces and wind, `(particles, t, dt) -> particles`
-            for all particles (`boundary.Particles`), applied in order.
+            for all particles (`boundary.Particles`), applied in order. Both kinds are called once
+            here with shapes alone (`jax.eval_shape`), so that one of the wrong dimension is named.
         body_force: acceleration `b(X0, t) -> (d,)` of one particle, m/s²; `X0` is needed.
         X0: initial positions for `body_force`, m, `(p, d)`.
         spline: interpolation, quadratic by default.
@@ -117,6 +120,7 @@ class Scene(eqx.Module):
             mask = getattr(condition, "mask", None)
             if mask is not None:
                 _check_shape("mask", mask, (n,))
+        _check_conditions(self)
         if self.body_force is not None and self.X0 is None:
             raise ValueError("Argument `X0` must be given with `body_force`, but is None.")
         if self.X0 is not None:
@@ -279,6 +283,92 @@ def _array(name: str, value: Any, *shapes: tuple[int, ...]) -> Array | np.ndarra
 def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
     if value.shape != shape:
         raise ValueError(f"Argument `{name}` must have shape {shape}, but has shape {value.shape}.")
+
+
+def _check_conditions(scene: Scene) -> None:
+    """Every condition goes with the dimension and the particles of the scene, by shapes alone."""
+    d, n = scene.grid.dimension, scene.particle_count
+    vector, number = _shape(d), _shape()
+    held = _shape(n, dtype=bool)
+    particles = Particles(_shape(n, d), _shape(n, d), _shape(n, d, d), _shape(n), held)
+    _check_calls(
+        f"`boundaries` must hold functions `(x, v, t) -> v` of vectors of shape ({d},)",
+        scene.boundaries,
+        (vector, vector, number),
+        vector,
+    )
+    _check_calls(
+        f"`particle_conditions` must hold functions `(particles, t, dt) -> particles` of {n} "
+        f"particles in {d} dimensions",
+        scene.particle_conditions,
+        (particles, number, number),
+        particles,
+    )
+
+
+def _check_calls(
+    rule: str, functions: tuple[Callable, ...], arguments: tuple[Any, ...], expected: Any
+) -> None:
+    """Each function takes the arguments and returns something of the expected shapes."""
+    for place, function in enumerate(functions, start=1):
+        name = getattr(function, "__name__", type(function).__name__)
+        try:
+            shapes = _returned_shapes(function, arguments)
+        except Exception as error:  # Whatever a user's function raises.
+            reason = str(error).partition("\n")[0]
+            raise ValueError(
+                f"Argument {rule}, but number {place} ({name}) raises {type(error).__name__}: "
+                f"{reason}"
+            ) from error
+        if shapes != _shapes(expected):
+            raise ValueError(
+                f"Argument {rule}, but number {place} ({name}) returns shape {shapes}."
+            )
+
+
+def _returned_shapes(function: Callable, arguments: tuple[Any, ...]) -> Any:
+    """Shapes of what a function returns, without computing it."""
+    leaves, structure = jax.tree.flatten(function)
+    known = all(eqx.is_array(leaf) for leaf in leaves)
+    abstract = tuple(
+        jax.ShapeDtypeStruct(a.shape, a.dtype) if eqx.is_array(a) else a for a in leaves
+    )
+    # Conditions made of numbers alone are traced once, however often scenes are made of them.
+    traced = _traced_shapes if known else _traced_shapes.__wrapped__
+    return traced(structure, abstract, arguments)
+
+
+@functools.lru_cache(maxsize=256)
+def _traced_shapes(structure: Any, leaves: tuple[Any, ...], arguments: tuple[Any, ...]) -> Any:
+    """The same of a function that is given as a tree.
+
+    The precision of the state is not known yet: it is enough that one will do.
+    """
+    function = jax.tree.unflatten(structure, leaves)
+
+    def in_precision(dtype: Any) -> Any:
+        given = jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct(a.shape, bool if a.dtype == bool else dtype), arguments
+        )
+        return _shapes(eqx.filter_eval_shape(lambda f, *a: cast(f, dtype)(*a), function, *given))
+
+    default = jnp.zeros(()).dtype
+    try:
+        return in_precision(default)
+    except Exception:
+        if default == jnp.float32:
+            raise
+        return in_precision(jnp.float32)
+
+
+def _shape(*shape: int, dtype: Any = jnp.float32) -> Any:
+    """An array of which only this is known."""
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def _shapes(tree: Any) -> Any:
+    """The shapes of the arrays of a tree, and the kind of whatever else is in it."""
+    return jax.tree.map(lambda a: getattr(a, "shape", type(a).__name__), tree)
 
 
 def _check_inside(scene: Scene, position: Array) -> None:

@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pgjax._files import replacing, with_suffix
 from pgjax._types import concrete
-from pgjax.render._files import replacing, with_suffix
 from pgjax.scene import Scene, initial_state
 from pgjax.simulate import Trajectory
 from pgjax.state import State

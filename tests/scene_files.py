@@ -27,6 +27,42 @@ E = 2e4
 nu = 0.3
 density = 1000
 """
+DROP = """
+name = "drop"
+[model]
+ply = "drop.ply"
+size = 0.5
+[grid]
+lower = [-0.5, -0.5, -0.2]
+upper = [0.5, 0.5, 0.8]
+spacing = 0.1
+[time]
+frames = 3
+fps = 25
+[forces]
+gravity = [0, 0, -9.81]
+[[material]]
+law = "fixed-corotated"
+E = 2e4
+nu = 0.3
+density = 1000
+region = { lower = [-1, -1, -1], upper = [1, 1, 0.25] }
+[[material]]
+law = "stvk-hencky"
+E = 2e4
+nu = 0.3
+density = 500
+plasticity = { type = "von-mises", yield_stress = 200 }
+[[boundary]]
+type = "half-space"
+point = [0, 0, -0.05]
+normal = [0, 0, 1]
+contact = "separating"
+friction = 0.3
+[camera]
+width = 64
+height = 48
+"""
 CAMERA = """
 [camera]
 width = 64
@@ -61,6 +97,14 @@ def sphere(n=3000, *, size=0.06, seed=1):
     sh[:, 0] = [1.0, -0.5, 0.2]
     parts = (normal, q, scales, np.full(n, 0.95), sh)
     return Gaussians.from_scales(*(jnp.asarray(a) for a in parts))
+
+
+def changed(text, *changes):
+    """A scene file with some of its text changed."""
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    return text
 
 
 def write(folder, *parts, name="scene.toml"):

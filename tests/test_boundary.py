@@ -11,6 +11,7 @@ from pgjax import boundary
 from pgjax.boundary.motion import step_of
 from pgjax.boundary.particles import Particles
 from pgjax.boundary.shapes import normal
+from pgjax.boundary.window import within
 from pgjax.linalg import rotation_change
 from pgjax.models.material import cast
 
@@ -207,6 +208,7 @@ def test_bad_motions_are_refused():
         (lambda: boundary.Steady((1.0, np.nan)), "`velocity` must be finite"),
         (lambda: boundary.Steady((1.0, 0.0), start=1.0, end=0.5), "`end` must be after `start`"),
         (lambda: boundary.Steady((1.0, 0.0), start=-np.inf), "`start` must be finite"),
+        (lambda: boundary.Steady((1.0, 0.0), end=np.ones(2)), "`end` must be one number, but has"),
         (lambda: boundary.KeyFrames((0.0,), [(0, 0)]), "`times` must be at least two increasing"),
         (lambda: boundary.KeyFrames((0, 0), [(0, 0), (1, 0)]), "`times` must be at least two"),
         (lambda: boundary.KeyFrames((0, 1), [(0, 0)]), "`shifts` must have shape"),
@@ -220,6 +222,10 @@ def test_bad_motions_are_refused():
         (
             lambda: boundary.Collider(boundary.Sphere((0, 0), 1.0), surface_velocity=1.0),
             "`surface_velocity` must be a vector",
+        ),
+        (
+            lambda: boundary.Collider(boundary.Sphere((0, 0), 1.0), start=np.zeros(3)),
+            r"`start` must be one number, but has shape \(3,\)",
         ),
     ):
         with pytest.raises(ValueError, match=words):
@@ -273,9 +279,95 @@ def test_sampled_distances_reproduce_quadratic_functions():
         np.testing.assert_allclose(shape.signed_distance(point), f(point), atol=1e-13)
         got = jax.grad(shape.signed_distance)(point)
         np.testing.assert_allclose(got, Q @ point + b, atol=1e-12)
+    # All that is linear in the lattice was done when the shape was made.
+    steps = jax.make_jaxpr(shape.signed_distance)(x[0]).eqns
+    assert all(out.aval.size < values.size for step in steps for out in step.outvars)
+
+    def distance(values):
+        return boundary.SampledSDF((0.0, 0.0), 0.25, values).signed_distance(x[0])
+
+    slope = jax.grad(distance)(values)
+    np.testing.assert_allclose(jnp.sum(slope * values), f(x[0]), atol=1e-13)
+    np.testing.assert_allclose(jnp.sum(slope), 1, rtol=1e-13)
+    assert not hasattr(shape, "values")
     edge, out = jnp.asarray([1.875, 0.8]), jnp.asarray([2.875, 0.8])
     gap = shape.signed_distance(out) - shape.signed_distance(edge)
     np.testing.assert_allclose(gap, 1.0, rtol=1e-12)
+
+
+# --- Windows of time -----------------------------------------------------------------------------
+
+
+def some_held(window, t):
+    """Whether a particle is led at time t."""
+    start, end = window
+    hold = boundary.ParticleMotion(jnp.ones(1, bool), resting(t.dtype), start, end)
+    zero = jnp.zeros((1, 2), t.dtype)
+    p = Particles(zero, zero, jnp.zeros((1, 2, 2), t.dtype), zero[:, 0] + 1, zero[:, 0] > 0)
+    return hold(p, t, t).held[0]
+
+
+def wall_acts(window, t):
+    start, end = window
+    body = boundary.Sphere(jnp.zeros(2, t.dtype), jnp.ones((), t.dtype))
+    wall = boundary.Collider(body, boundary.Sticky(), start=start, end=end)
+    return wall(jnp.full(2, 0.1, t.dtype), jnp.ones(2, t.dtype), t)[0] == 0
+
+
+def steady_moves(window, t):
+    start, end = window
+    moving = boundary.Steady(jnp.ones(2, t.dtype), start=start, end=end)
+    return moving.at(t).velocity[0] > 0
+
+
+def key_frames_move(window, t):
+    """Between the second and the third of four."""
+    start, end = window
+    one = jnp.ones((), t.dtype)
+    shifts = jnp.zeros((4, 2), t.dtype).at[2:].set(1)
+    path = boundary.KeyFrames(jnp.stack([start - one, start, end, end + one]), shifts)
+    return path.at(t).velocity[0] > 0
+
+
+def resting(dtype):
+    zero = jnp.zeros((), dtype)
+    return boundary.Steady(jnp.zeros(2, dtype), start=zero, end=zero + 1)
+
+
+@pytest.mark.parametrize("precision", [jnp.float32, pytest.param(jnp.float64, marks=double)])
+@pytest.mark.parametrize("acts", [some_held, wall_acts, steady_moves, key_frames_move])
+def test_as_many_steps_act_as_fit_into_the_window(acts, precision):
+    """Windows that end on frames, for many frame rates and time steps: not one step too long."""
+    frames = np.array([1, 2, 3, 5, 7, 12, 24, 97])
+    step = jnp.arange(98 * 33, dtype=jnp.int32).astype(precision)
+
+    @jax.jit
+    def counted(window, t):
+        steps = jax.vmap(acts, in_axes=(None, 0))
+        return jax.vmap(lambda *ends: jnp.sum(steps(ends, t)))(*window)
+
+    for fps in (24, 25, 30, 60):
+        for substeps in (1, 3, 5, 7, 10, 20, 33):
+            window = [jnp.asarray(f / fps, precision) for f in (frames, frames + 1)]
+            # As the step has it.
+            t = step * jnp.asarray(1 / fps / substeps, precision)
+            np.testing.assert_array_equal(counted(window, t), substeps)
+
+
+@pytest.mark.parametrize("t", [0.0, 1e-30, 3.0])
+def test_open_windows_have_no_edges(t):
+    t, infinite = jnp.asarray(t), jnp.asarray(jnp.inf)
+    assert bool(within(t, -infinite, infinite))
+    assert not bool(within(t, infinite, infinite))
+    assert bool(within(t, -infinite, t + 1))
+    assert not bool(within(t, -infinite, t))
+    assert bool(within(t, t, infinite))
+
+    def moved(start, t):
+        return boundary.Steady((1.0, 0.0), start=start).shift(t)[0]
+
+    value, slopes = jax.value_and_grad(moved, argnums=(0, 1))(jnp.asarray(-1.0), t)
+    np.testing.assert_allclose((value, *slopes), (t + 1, -1, 1), rtol=1e-6)
 
 
 # --- Conditions of particles ---------------------------------------------------------------------
@@ -410,8 +502,28 @@ def test_wind_may_depend_on_place_and_time():
 def test_bad_conditions_of_particles_are_refused():
     mask, rest = np.ones(3, bool), boundary.Steady((0.0, 0.0))
     for make, words in (
-        (lambda: boundary.ParticleMotion(mask, rest, end=np.ones(4)), "`end` must be one number"),
+        (
+            lambda: boundary.ParticleMotion(mask, rest, end=np.ones(4)),
+            "`end` must be one number or",
+        ),
         (lambda: boundary.ParticleMotion(mask, rest, start=2.0, end=1.0), "`end` must be after"),
+        (
+            lambda: boundary.ParticleMotion(mask, rest, start=(0.0, 3.0, 2.0), end=1.0),
+            r"`end` must be after `start` = 3.0 s, but is 1.0 s at index \(1,\) \(2 bad entries\)",
+        ),
+        (
+            lambda: boundary.ParticleMotion(mask, rest, start=2.0, end=(3.0, 1.0, np.nan)),
+            r"`end` must be after `start` = 2.0 s, but is 1.0 s at index \(1,\) \(2 bad entries\)",
+        ),
+        (
+            lambda: boundary.ParticleMotion(mask, rest, start=np.zeros(4), end=np.ones(5)),
+            r"`start` must be one number or one per particle \(3,\), but has shape \(4,\)",
+        ),
+        (lambda: boundary.ParticleForce(mask, (1.0, 0.0), end=np.ones(3)), "`end` must be one n"),
+        (lambda: boundary.Wind((1.0, 0.0), start=np.zeros(3)), "`start` must be one number, but"),
+        (lambda: boundary.ParticleImpulse(mask, (1.0, 0.0), np.zeros(3)), "`start` must be one n"),
+        (lambda: boundary.ParticleImpulse(mask, 1.0), "`momentum` must be a vector"),
+        (lambda: boundary.ParticleImpulse(mask, (1.0, np.nan)), "`momentum` must be finite"),
         (lambda: boundary.ParticleForce(~mask, (1.0, 0.0)), "`mask` must select at least one"),
         (lambda: boundary.ParticleForce(mask, 1.0), "`force` must be a vector"),
         (lambda: boundary.ParticleImpulse(mask, (1.0, 0.0), duration=-1.0), "`duration` must be"),

@@ -285,6 +285,88 @@ def test_bad_arguments_are_named(call, words):
         call()
 
 
+REST_3D = boundary.Steady((0.0, 0.0, 0.0))
+DISC = boundary.Sphere((0.0, 0.0), 1.0)
+ALL = np.ones(8, bool)
+
+
+def speed(_x, v, _t):
+    return jnp.sqrt(jnp.sum(v * v))
+
+
+def nothing(*_):
+    return None
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        boundary.Collider(boundary.Sphere((0.0, 0.0, 0.0), 1.0)),
+        boundary.Collider(DISC, motion=REST_3D),
+        boundary.Collider(DISC, surface_velocity=(1.0, 0.0, 0.0)),
+        boundary.Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+        speed,
+    ],
+    ids=lambda condition: getattr(condition, "__name__", type(condition).__name__),
+)
+def test_walls_of_another_dimension_are_named(condition):
+    """Which one it is, before anything is compiled."""
+    name = getattr(condition, "__name__", type(condition).__name__)
+    words = rf"`boundaries` must hold .* of shape \(2,\), but number 2 \({name}\) (raises|returns) "
+    with pytest.raises(ValueError, match=words):
+        scene_of(boundaries=[HELD, condition])
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        boundary.ParticleMotion(ALL, REST_3D),
+        boundary.ParticleForce(ALL, (1.0, 0.0, 0.0)),
+        boundary.ParticleImpulse(ALL, (1.0, 0.0, 0.0)),
+        boundary.Wind((1.0, 0.0, 0.0), 1.0),
+        nothing,
+    ],
+    ids=lambda condition: getattr(condition, "__name__", type(condition).__name__),
+)
+def test_conditions_of_another_dimension_are_named(condition):
+    name = getattr(condition, "__name__", type(condition).__name__)
+    words = rf"8 particles in 2 dimensions, but number 1 \({name}\) (raises|returns shape None)"
+    with pytest.raises(ValueError, match=words):
+        scene_of(particle_conditions=[condition])
+
+
+def test_scenes_are_made_and_checked_inside_transformations():
+    """The check is of shapes: values that are traced or batched pass, wrong shapes do not."""
+
+    def scene(p, point=(0.0, 0.0)):
+        wall = boundary.Collider(boundary.Sphere(jnp.asarray(point) + p, 1.0), motion=REST)
+        wind = boundary.Wind(lambda x, _: p * x, rate=p)
+        return scene_of(boundaries=[wall, lambda _x, v, _t: p * v], particle_conditions=[wind])
+
+    def shift(p):
+        return jnp.sum(scene(p).boundaries[0].shape.center)
+
+    one = jnp.asarray(1.0)
+    assert float(jax.grad(shift)(one)) == 2
+    np.testing.assert_array_equal(jax.jit(jax.vmap(shift))(jnp.arange(3.0)), [0, 2, 4])
+    batch = jax.vmap(lambda p: scene_of(boundaries=[boundary.Box((p, p), (p + 1, p + 1))]))(
+        jnp.arange(3.0)
+    )
+    assert batch.boundaries[0].lower.shape == (3, 2)
+    moved = eqx.tree_at(lambda s: s.boundaries[0].lower, batch, batch.boundaries[0].lower - 1)
+    assert float(moved.boundaries[0].lower[0, 0]) == -1
+    with pytest.raises(ValueError, match="`boundaries` must"):
+        jax.vmap(lambda p: scene(p, (0.0, 0.0, 0.0)).volumes)(jnp.arange(3.0))
+
+
+def test_functions_may_have_another_precision_than_the_default():
+    """What a function closes over has the precision of the state, not of the scene."""
+    normal = jnp.asarray([0.0, 1.0], jnp.float32)
+    scene = scene_of(boundaries=[lambda _x, v, _t: v - jnp.sum(v * normal) * normal])
+    state = pgjax.initial_state(scene, points(), dtype=np.float32)
+    assert bool(rollout(scene, state, DT, steps=1).status.ok)
+
+
 def test_double_precision_must_be_switched_on():
     code = """
 import numpy as np, pgjax, pgjax.models as pm

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pgjax.render import VideoWriter, save_image, save_video
+from pgjax.render.media import load_image
 
 
 def frames(count=4, shape=(35, 51)):
@@ -30,6 +31,15 @@ def test_png_holds_the_clipped_image(tmp_path):
     save_image(tmp_path / "a.png", image)
     stored = imageio.imread(tmp_path / "a.png")
     np.testing.assert_allclose(stored / 255, np.clip(image, 0, 1), atol=0.5 / 255 + 1e-9)
+
+
+def test_an_image_read_and_written_again_is_the_same(tmp_path):
+    save_image(tmp_path / "a.png", np.arange(256 * 3).reshape(16, 16, 3) / 767)
+    image = load_image(tmp_path / "a.png")
+    assert image.shape == (16, 16, 3)
+    assert image.max() == 1
+    save_image(tmp_path / "b.png", image)
+    assert (tmp_path / "b.png").read_bytes() == (tmp_path / "a.png").read_bytes()
 
 
 def test_mp4_keeps_frames_and_colours_and_pads_odd_sizes(tmp_path):

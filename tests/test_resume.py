@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scene_files import DROP, changed, write
 
 import pgjax
 import pgjax.models as pm
@@ -29,43 +30,12 @@ from pgjax.storage import digest
 RUN = sys.modules["pgjax.scenes.run"]
 RECORD = sys.modules["pgjax.scenes.record"]
 
-SCENE = """
-name = "drop"
-[model]
-ply = "drop.ply"
-size = 0.5
-up = [0, 0, 1]
-[grid]
-lower = [-0.5, -0.5, -0.2]
-upper = [0.5, 0.5, 0.8]
-spacing = 0.1
-[time]
-frames = 6
-fps = 25
-[forces]
-gravity = [0, 0, -9.81]
-[[material]]
-law = "fixed-corotated"
-E = 2e4
-nu = 0.3
-density = 1000
-region = { lower = [-1, -1, -1], upper = [1, 1, 0.25] }
-[[material]]
-law = "stvk-hencky"
-E = 2e4
-nu = 0.3
-density = 500
-plasticity = { type = "von-mises", yield_stress = 200, hardening = 0.1 }
-[[boundary]]
-type = "half-space"
-point = [0, 0, -0.05]
-normal = [0, 0, 1]
-contact = "separating"
-friction = 0.3
-[camera]
-width = 64
-height = 48
-"""
+SCENE = changed(
+    DROP,
+    ("size = 0.5", "size = 0.5\nup = [0, 0, 1]"),
+    ("frames = 3", "frames = 6"),
+    ("yield_stress = 200", "yield_stress = 200, hardening = 0.1"),
+)
 
 
 def captured(seed=0, n=80):
@@ -88,12 +58,7 @@ def folder(tmp_path_factory):
 
 def planned(folder, *changes, frames=None):
     """The plan of the scene, with some of its text changed."""
-    text = SCENE
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new, 1)
-    path = folder / "changed.toml"
-    path.write_text(text)
+    path = write(folder, changed(SCENE, *changes), name="changed.toml")
     return plan(read_scene(path), frames=frames)
 
 

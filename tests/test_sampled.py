@@ -146,6 +146,12 @@ def test_bad_spacings_of_a_mesh_are_refused():
             boundary.sample_mesh(cube_mesh(), spacing=spacing)
 
 
+def test_bad_turns_of_a_mesh_are_refused():
+    for turn, words in ((0.5, r"`turn` must have shape \(3,\)"), ((0, 0, np.nan), "be finite")):
+        with pytest.raises(ValueError, match=words):
+            boundary.sample_mesh(cube_mesh(), spacing=0.1, turn=turn)
+
+
 BAD_POINTS = {
     "n ≥ 1": (np.zeros((0, 3)), 0.1, None),
     "`points` must be finite": (np.full((2, 3), np.inf), 0.1, None),

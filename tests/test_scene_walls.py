@@ -150,6 +150,25 @@ def test_a_mesh(tmp_path):
         planned(tmp_path, MODEL, GRID, JELLY, '[[boundary]]\ntype = "mesh"\nfile = "cube.obj"')
 
 
+def test_a_mesh_can_be_turned(tmp_path):
+    """About the origin of its file, once it has its size, and before it is put in its place."""
+    vertices = [line.split() for line in CUBE.splitlines() if line.startswith("v")]
+    faces = [line for line in CUBE.splitlines() if line.startswith("f")]
+    # A bar of 2 m along x, from the origin on.
+    bar = [f"v {2 * (int(x) + 500)} {y} {z}" for _, x, y, z in vertices]
+    (tmp_path / "bar.obj").write_text("\n".join(bar + faces) + "\n")
+    text = (
+        'type = "mesh"\nfile = "bar.obj"\nscale = 1e-3\nposition = [0.2, 0, 0]\nspacing = 0.1\n'
+        "rotation = [{ axis = [0, 0, 1], angle = 90 }, { axis = [1, 0, 0], angle = 90 }]\n"
+        "motion = { angular_velocity = [0, 0, 90] }"
+    )
+    found = wall(tmp_path, text)
+    # x became y, and then z.
+    for x, distance in [((0.2, 0, 1), -0.5), ((0.2, 0, 2.2), 0.2), ((0.9, 0, 1), 0.2)]:
+        np.testing.assert_allclose(found.shape.signed_distance(jnp.asarray(x)), distance, atol=0.03)
+    np.testing.assert_allclose(found.motion.pivot, [0.2, 0, 1], atol=1e-6)
+
+
 UPPER = '\nregion = { shape = "half-space", point = [0, 0, 0.25], normal = [0, 0, 1] }'
 LEAD = {
     'type = "hold"': lambda m, _: ParticleMotion(m, Steady((0.0, 0, 0)), -np.inf, np.inf),
@@ -389,5 +408,7 @@ grid_damping = 8
     lowest = float(jnp.min(end.final.x[:, 2]))
     assert abs(lowest - (ground_z + 0.1)) < 0.1
     assert float(jnp.abs(jnp.mean(end.final.v, axis=0)).max()) < 0.05
-    with pytest.raises(SceneError, match="no Gaussian that does not move is in the grid"):
-        planned(tmp_path, model.replace("radius = 0.5", "radius = 50"), grid, JELLY, wall)
+    words = "no Gaussian that does not move is in the grid .`surroundings = false` of a model"
+    for bare in (model.replace("radius = 0.5", "radius = 50"), model + "surroundings = false\n"):
+        with pytest.raises(SceneError, match=words):
+            planned(tmp_path, bare, grid, JELLY, wall)

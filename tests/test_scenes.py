@@ -8,6 +8,7 @@ import imageio_ffmpeg
 import jax
 import numpy as np
 import pytest
+from scene_files import DROP, changed, write
 
 from pgjax import cli
 from pgjax.render import Gaussians, load_ply, save_ply
@@ -15,43 +16,8 @@ from pgjax.result import SimulationError
 from pgjax.scenes import SceneError, plan, presets, read_scene, resolve
 from pgjax.scenes.capture import upright
 
-SCENE = """
-name = "drop"
-[model]
-ply = "drop.ply"
-region = { lower = [-1, -3, -1], upper = [1, -0.5, 1] }
-size = 0.5
-[grid]
-lower = [-0.5, -0.5, -0.2]
-upper = [0.5, 0.5, 0.8]
-spacing = 0.1
-[time]
-frames = 3
-fps = 25
-[forces]
-gravity = [0, 0, -9.81]
-[[material]]
-law = "fixed-corotated"
-E = 2e4
-nu = 0.3
-density = 1000
-region = { lower = [-1, -1, -1], upper = [1, 1, 0.25] }
-[[material]]
-law = "stvk-hencky"
-E = 2e4
-nu = 0.3
-density = 500
-plasticity = { type = "von-mises", yield_stress = 200 }
-[[boundary]]
-type = "half-space"
-point = [0, 0, -0.05]
-normal = [0, 0, 1]
-contact = "separating"
-friction = 0.3
-[camera]
-width = 64
-height = 48
-"""
+BODY = "region = { lower = [-1, -3, -1], upper = [1, -0.5, 1] }"
+SCENE = changed(DROP, ("size = 0.5", f"{BODY}\nsize = 0.5"))
 
 
 def captured(n=200, seed=0):
@@ -79,12 +45,9 @@ def folder(tmp_path):
     return tmp_path
 
 
-def changed(folder, old, new):
-    """The scene with one line changed."""
-    assert old in SCENE
-    path = folder / "changed.toml"
-    path.write_text(SCENE.replace(old, new, 1))
-    return path
+def with_change(folder, old, new):
+    """The path of the scene with one line changed."""
+    return write(folder, changed(SCENE, (old, new)), name="changed.toml")
 
 
 def test_plan_places_splits_and_orders(folder):
@@ -148,9 +111,23 @@ def test_upright(up):
     ],
 )  # fmt: skip
 def test_mistakes_are_named(folder, old, new, words):
-    path = changed(folder, old, new)
+    path = with_change(folder, old, new)
     with pytest.raises(ValueError, match=re.escape(words)):
         plan(read_scene(path))
+
+
+@pytest.mark.parametrize("options", [[], ["--dry-run"]], ids=["run", "dry run"])
+def test_a_time_step_above_the_limit_is_refused_before_a_folder_is_begun(folder, options, capsys):
+    limit = float(plan(read_scene(folder / "drop.toml")).scene.rest_limit())
+    path = with_change(folder, "fps = 25", f"fps = 25\ndt = {1.001 * limit}")
+    assert cli.main(["run", str(path), "--out", str(folder / "out"), *options]) == 1
+    assert capsys.readouterr().err == (
+        f"pgjax: changed.toml [time]: `dt` must be at most {limit:.4g} s, the largest stable time "
+        f"step at rest, but is {1.001 * limit:g}.\n"
+    )
+    assert not (folder / "out").exists()
+    p = plan(read_scene(with_change(folder, "fps = 25", f"fps = 25\ndt = {limit}")))
+    assert 0.9 * limit < p.dt <= limit * (1 + 1e-6)
 
 
 def test_files_that_are_not_there(folder, capsys):
@@ -193,7 +170,7 @@ def test_run_writes_video_pictures_and_plys(folder, capsys):
 
 
 def test_leaving_the_grid_keeps_what_was_computed(folder, capsys):
-    path = changed(folder, "point = [0, 0, -0.05]", "point = [0, 0, -9]")
+    path = with_change(folder, "point = [0, 0, -0.05]", "point = [0, 0, -9]")
     path.write_text(path.read_text().replace("frames = 3", "frames = 30"))
     out = folder / "lost"
     assert cli.main(["run", str(path), "--out", str(out)]) == 1

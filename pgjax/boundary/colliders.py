@@ -22,8 +22,9 @@ from pgjax._types import (
     require_vector,
 )
 from pgjax.boundary.contact import AbstractContact, Separating, Sticky
-from pgjax.boundary.motion import AbstractMotion, require_window
+from pgjax.boundary.motion import AbstractMotion
 from pgjax.boundary.shapes import AbstractShape, normal
+from pgjax.boundary.window import require_window, within
 
 Vector = Float[Array, " d"]
 
@@ -108,7 +109,7 @@ class Collider(AbstractGridCondition):
     ) -> Vector:
         n = turned(normal(self.shape, at_rest))
         inside = self.shape.signed_distance(at_rest) <= _tolerance(x, at_rest)
-        active = (t >= self.start) & (t < self.end)
+        active = within(t, self.start, self.end)
         # Without a normal (in the centre of a sphere) the material moves with the body.
         contact = jnp.where(jnp.any(n != 0), self.contact(v - wall, n), Sticky()(v, n))
         return jnp.where(inside & active, wall + contact, v)

@@ -19,6 +19,7 @@ from pgjax._types import (
     require_like,
     require_vector,
 )
+from pgjax.boundary.window import require_window, slack, within
 from pgjax.linalg import apply, rotation_change
 
 Vector = Float[Array, " d"]
@@ -136,8 +137,8 @@ class Steady(AbstractMotion):
         require_window(self.start, self.end)
 
     def _elapsed(self, t: Scalar) -> Scalar:
-        moved = jnp.where(t < self.end, t - self.start, self.end - self.start)
-        return jnp.where(t < self.start, 0, moved)
+        before_or_after = jnp.where(t < self.start, 0, self.end - self.start)
+        return jnp.where(within(t, self.start, self.end), t - self.start, before_or_after)
 
     def shift(self, t: Scalar) -> Vector:
         """`velocity` times the time spent in the window."""
@@ -199,9 +200,9 @@ class KeyFrames(AbstractMotion):
 
     def _at(self, t: Scalar, values: Float[Array, "k n"]) -> Float[Array, " n"]:
         last = self.times.shape[0] - 2
-        i = jnp.clip(jnp.searchsorted(self.times, t, side="right") - 1, 0, last)
+        i = jnp.clip(jnp.sum(self.times - t <= slack(t)) - 1, 0, last)
         t0, t1 = self.times[i], self.times[i + 1]
-        inside = (t >= self.times[0]) & (t < self.times[-1])
+        inside = within(t, self.times[0], self.times[-1])
         s = jnp.where(inside, (t - t0) / (t1 - t0), jnp.where(t < t0, 0, 1))
         return values[i] + s * (values[i + 1] - values[i])
 
@@ -245,9 +246,3 @@ def require_turn(name: str, turn: Array, linear: Array) -> None:
             f"has shape {turn.shape}."
         )
     require(name, turn, "be finite", np.isfinite)
-
-
-def require_window(start: Array, end: Array) -> None:
-    """Refuse a time window that ends before it starts."""
-    first = concrete(start)
-    require("end", end, f"be after `start` = {first} s", lambda a: first is None or (a > first))

@@ -24,9 +24,11 @@ from pgjax._types import (
     nonnegative,
     parameter,
     require,
+    require_number,
     require_vector,
 )
-from pgjax.boundary.motion import AbstractMotion, require_window, step_of
+from pgjax.boundary.motion import AbstractMotion, step_of
+from pgjax.boundary.window import require_window, require_windows, within
 
 
 class Particles(NamedTuple):
@@ -79,17 +81,11 @@ class ParticleMotion(AbstractParticleCondition):
 
     def __check_init__(self):
         _check_mask(self.mask)
-        require_window(self.start, self.end)
-        for name in ("start", "end"):
-            if getattr(self, name).shape not in ((), self.mask.shape):
-                raise ValueError(
-                    f"Argument `{name}` must be one number or one per particle "
-                    f"{self.mask.shape}, but has shape {getattr(self, name).shape}."
-                )
+        require_windows(self.start, self.end, self.mask)
 
     def __call__(self, particles: Particles, t: Scalar, dt: Scalar) -> Particles:
         """Velocities that carry the particles along the motion in this step, and its spin."""
-        led = self.mask & (t >= self.start) & (t < self.end)
+        led = self.mask & within(t, self.start, self.end)
 
         def one(x: Float[Array, " d"]) -> tuple[Array, Array]:
             return step_of(self.motion, x, t, dt)
@@ -153,6 +149,9 @@ class ParticleImpulse(AbstractParticleCondition):
     def __check_init__(self):
         _check_mask(self.mask)
         _require_some(self.mask)
+        require_vector("momentum", self.momentum)
+        for name in ("start", "duration"):
+            require_number(name, getattr(self, name))
         require("duration", self.duration, "be at least 0 s", lambda a: a >= 0)
 
     def __call__(self, particles: Particles, t: Scalar, dt: Scalar) -> Particles:

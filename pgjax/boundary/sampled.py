@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from pgjax._types import positive, require
 from pgjax.boundary.shapes import SampledSDF
@@ -21,7 +22,11 @@ _MARGIN = 3  # nodes around the body
 
 
 def sample_mesh(
-    mesh: str | os.PathLike[str] | tuple[Any, Any], *, spacing: float, scale: float = 1.0
+    mesh: str | os.PathLike[str] | tuple[Any, Any],
+    *,
+    spacing: float,
+    scale: float = 1.0,
+    turn: Any = (0.0, 0.0, 0.0),
 ) -> SampledSDF:
     """The signed distance to a closed triangle mesh.
 
@@ -33,6 +38,7 @@ def sample_mesh(
         mesh: a file (.obj, .off, .stl, .ply), or vertices `(n, 3)` and triangles `(m, 3)`.
         spacing: distance of the nodes, m; about that of the simulation's grid or half of it.
         scale: multiplies the vertices, e.g. 1e-3 for a file in millimetres.
+        turn: rotation vector about the origin of the vertices, rad, `(3,)`.
 
     Raises:
         ValueError: no such file, not a mesh, or too many nodes.
@@ -40,8 +46,13 @@ def sample_mesh(
     """
     require("spacing", spacing, "be positive and finite (m)", positive)
     require("scale", scale, "be positive and finite", positive)
+    turn = np.asarray(turn, np.float64)
+    if turn.shape != (3,):
+        raise ValueError(f"Argument `turn` must have shape (3,), but has shape {turn.shape}.")
+    require("turn", turn, "be finite (rad)", np.isfinite)
     vertices, faces = _read(mesh) if isinstance(mesh, str | os.PathLike) else _arrays(*mesh)
-    return _sampled(vertices * scale, faces, float(spacing), 0.0)
+    placed = scale * Rotation.from_rotvec(turn).apply(vertices)
+    return _sampled(placed, faces, float(spacing), 0.0)
 
 
 def sample_points(

@@ -200,39 +200,41 @@ class SampledSDF(AbstractShape):
         origin: first node, m, `(d,)`.
         spacing: distance of the nodes, m.
         values: signed distance at the nodes, m, one axis per direction, at least 3 along each.
+            They are kept as `coefficients` of the splines, m, of the same shape: to change or to
+            differentiate values, make another one of them.
     """
 
     origin: Array
     spacing: Array
-    values: Array
+    coefficients: Array
 
     def __init__(self, origin: Any, spacing: Any, values: Any):
         self.origin = as_float_array(origin)
         self.spacing = as_float_array(spacing)
-        self.values = as_float_array(values)
-
-    def __check_init__(self):
+        values = as_float_array(values)
+        # Checked here, since the values are not kept.
         require_vector("origin", self.origin)
         require("spacing", self.spacing, "be positive and finite (m)", positive)
         d = self.origin.shape[0]
-        if self.values.ndim != d or min(self.values.shape) < 3:
+        if values.ndim != d or min(values.shape) < 3:
             raise ValueError(
                 f"Argument `values` must have {d} axes of at least 3 nodes each, but has shape "
-                f"{self.values.shape}."
+                f"{values.shape}."
             )
-        require("values", self.values, "be finite (m)", np.isfinite)
+        require("values", values, "be finite (m)", np.isfinite)
+        self.coefficients = _coefficients(values)
 
     def signed_distance(self, x: Vector) -> Scalar:
         """Interpolated inside the grid, continued by the distance to it outside."""
         spline, d = BSpline(2), x.shape[0]
         xi = (x - self.origin) / self.spacing
-        last = jnp.asarray(self.values.shape, x.dtype) - 1
+        last = jnp.asarray(self.coefficients.shape, x.dtype) - 1
         # Half a cell from the edge, so that every stencil has its three nodes.
         near = jnp.clip(xi, 0.5, last - 0.5)
         base = jnp.minimum(spline.base(near), last - 2)
         w, _ = spline.weights(near - jax.lax.stop_gradient(base))
         start = [base[i].astype(jnp.int32) for i in range(d)]
-        c = jax.lax.dynamic_slice(_coefficients(self.values.astype(x.dtype)), start, (3,) * d)
+        c = jax.lax.dynamic_slice(self.coefficients.astype(x.dtype), start, (3,) * d)
         for i in range(d):
             c = jnp.tensordot(w[:, i], c, axes=1)
         return c + self.spacing * safe_norm(xi - near)

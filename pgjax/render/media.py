@@ -13,8 +13,8 @@ import imageio_ffmpeg
 import numpy as np
 from jax.typing import ArrayLike
 
+from pgjax._files import replacing, with_suffix
 from pgjax._types import require
-from pgjax.render._files import replacing, with_suffix
 
 # Options of the encoder. Colours of .mp4 follow BT.709 and say so, else players guess by the size.
 _ENCODINGS = {
@@ -44,6 +44,14 @@ def save_image(path: str | os.PathLike[str], rgb: ArrayLike) -> None:
     pixels = _bytes("rgb", rgb)
     with replacing(target) as temporary:
         imageio.imwrite(temporary, pixels)
+
+
+def load_image(path: str | os.PathLike[str]) -> np.ndarray:
+    """An image file as `save_image` takes it: shape (height, width, 3), floating, in [0, 1].
+
+    What was read and is written again has the same pixels.
+    """
+    return np.asarray(imageio.imread(Path(path)), np.float64) / 255
 
 
 def save_video(

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from pgjax._files import replacing
 from pgjax.render import compressed
-from pgjax.render._files import replacing
 from pgjax.render.gaussians import Gaussians
 from pgjax.render.harmonics import COUNTS, rotate_coefficients
 

@@ -74,7 +74,8 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         frames: number of frames in place of the file's own.
 
     Raises:
-        SceneError: a model is missing or unusable, or the parts of the file do not fit together.
+        SceneError: a model is missing or unusable, the parts of the file do not fit together, or
+            its time step is too long.
     """
     if ply is not None:
         file = _with_model(file, ply)
@@ -87,8 +88,8 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         scene = _scene(file, crowd, counts, still)
         v, C = crowd.velocities()
         state = initial_state(scene, crowd.x, v, C=C)
-        limit = file.time.dt or stable_dt(scene, state, fraction=file.time.fraction)
-        substeps = substeps_for(1 / file.time.fps, limit)
+        longest = _longest_step(file, scene, state)
+        substeps = substeps_for(1 / file.time.fps, longest)
     return Plan(
         name=file.name,
         scene=scene,
@@ -103,6 +104,20 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         view=file.camera,
         notes=tuple(note for b in bodies for note in b.notes),
     )
+
+
+def _longest_step(file: SceneFile, scene: Scene, state: State) -> float:
+    """The time step of the file, or a stable one, s; a frame is a whole number of those below."""
+    if file.time.dt is None:
+        return stable_dt(scene, state, fraction=file.time.fraction)
+    limit = float(scene.rest_limit())
+    # The limit may be known to single precision only.
+    if file.time.dt > limit * (1 + 1e-6):
+        raise SceneError(
+            f"{file.source} [time]: `dt` must be at most {limit:.4g} s, the largest stable time "
+            f"step at rest, but is {file.time.dt:g}."
+        )
+    return file.time.dt
 
 
 def _with_model(file: SceneFile, ply: Path) -> SceneFile:

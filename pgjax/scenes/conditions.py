@@ -16,7 +16,7 @@ from pgjax.boundary import (
     release_times,
 )
 from pgjax.scenes.motions import ZERO, motion, window
-from pgjax.scenes.reader import Table
+from pgjax.scenes.reader import REQUIRED, Table
 from pgjax.scenes.regions import Selection, selection
 
 # A condition from a mask of the particles and the positions of all.
@@ -73,14 +73,12 @@ def _release(t: Table) -> Make:
     direction = t.vector("direction")
     if not any(direction):
         raise t.error("direction", "not be zero")
-    start, end = t.number("start", 0.0), t.number("end")
-    if not end > start:
-        raise t.error("end", f"be after `start` = {start:g} s")
+    times = window(t, start=0.0, end=REQUIRED)
     layers = t.integer("layers", None, at_least=2)
 
     def make(mask: np.ndarray, x: np.ndarray) -> AbstractParticleCondition:
         ends = np.full(len(mask), math.inf)
-        ends[mask] = release_times(x[mask], direction, start=start, end=end, layers=layers)
+        ends[mask] = release_times(x[mask], direction, layers=layers, **times)
         return ParticleMotion(mask, Steady(ZERO), start=-math.inf, end=ends)
 
     return make

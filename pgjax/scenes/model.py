@@ -36,7 +36,7 @@ class ModelPart:
         turn: rotation of the upright model, `(3, 3)`.
         opacity_above: Gaussians of no more opacity are left out.
         region: the part that is simulated, in the model's coordinates; all if None.
-        surroundings: whether what is outside the region is drawn.
+        surroundings: whether what is outside the region is kept, drawn and as a wall.
         size: longest side of the simulated part, m.
         position: where its foot stands, m.
         velocity: at the start, m/s.

@@ -22,9 +22,9 @@ def motion(t: Table) -> Motion:
     return lambda center: make(center if pivot is None else pivot)
 
 
-def window(t: Table) -> dict[str, Any]:
-    """The times `start` and `end` between which something acts."""
-    start, end = t.number("start", -math.inf), t.number("end", math.inf)
+def window(t: Table, start: float = -math.inf, end: Any = math.inf) -> dict[str, Any]:
+    """The times `start` and `end` between which something acts; the defaults, or `REQUIRED`."""
+    start, end = t.number("start", start), t.number("end", end)
     if not end > start:
         raise t.error("end", f"be after `start` = {start:g} s")
     return {"start": start, "end": end}
@@ -33,10 +33,8 @@ def window(t: Table) -> dict[str, Any]:
 def _steady(t: Table) -> Motion:
     t.tables("keyframes")
     velocity, spin = t.vector("velocity", ZERO), radians(t.vector("angular_velocity", ZERO))
-    start, end = t.number("start", 0.0), t.number("end", math.inf)
-    if not end > start:
-        raise t.error("end", f"be after `start` = {start:g} s")
-    return lambda pivot: Steady(velocity, spin, pivot, start, end)
+    times = window(t, start=0.0)
+    return lambda pivot: Steady(velocity, spin, pivot, **times)
 
 
 def _key_frames(t: Table) -> Motion:

@@ -19,12 +19,12 @@ from pgjax.render import (
     bound_stretch,
     concatenate,
     deform,
-    media,
     render,
     save_image,
     save_ply,
     save_video,
 )
+from pgjax.render.media import load_image
 from pgjax.result import ERRORS, Condition, SimulationError, SimulationWarning
 from pgjax.scenes.build import Plan
 from pgjax.scenes.record import (
@@ -172,7 +172,8 @@ class _Recorder:
         if record.frame > self._kept:
             self._keep()
         last, fps = record.frame, self._plan.fps
-        pictures = (_picture(self._folder, frame) for frame in range(last + 1))
+        # Read again, they become the same bytes as they were written as.
+        pictures = (load_image(picture_path(self._folder, frame)) for frame in range(last + 1))
         save_video(self._folder / "video.mp4", pictures, fps=fps)
         for name, frame in (("first.png", 0), ("last.png", last)):
             with durably_replacing(self._folder / name) as temporary:
@@ -258,11 +259,6 @@ def carried(plan: Plan, x: jax.Array, F: jax.Array) -> tuple[Gaussians, int]:
 def _draw(plan: Plan, gaussians: Gaussians, frame: int) -> np.ndarray:
     image = render(gaussians, plan.camera(frame), background=plan.view.background)
     return np.clip(np.asarray(image.rgb), 0, 1)
-
-
-def _picture(folder: Path, frame: int) -> np.ndarray:
-    """A frame as it was drawn; `save_video` makes the same bytes of it as `save_image` did."""
-    return np.asarray(media.imageio.imread(picture_path(folder, frame)), np.float64) / 255
 
 
 def _summed_up(plan: Plan, state: State, record: Record, seconds: float) -> dict[str, Any]:

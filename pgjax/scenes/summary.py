@@ -35,7 +35,7 @@ def summary(plan: Plan) -> str:
         f"{plan.substeps} steps a frame, {plan.frames} frames at {plan.fps:g} per second",
         f"computing  {state_kind(plan)} on {jax.devices()[0].platform.upper()}, "
         f"JAX {jax.__version__}",
-        *(f"note       {note}" for note in getattr(plan, "notes", ())),
+        *(f"note       {note}" for note in plan.notes),
     ]
     return "\n".join(lines)
 

@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 
+from pgjax._types import as_float_array
 from pgjax.boundary import (
     AbstractContact,
     AbstractShape,
@@ -105,11 +107,13 @@ def _collider(body: Callable[[Table], Callable[[Site], _Body]]) -> Callable:
     """The reader of a wall of some shape: contact, motion and window are the same for all."""
 
     def read(t: Table) -> Callable[[Site], Callable]:
+        """The wall of a table, once its site is known."""
         shaped, contact, hollow = body(t), _contact(t), t.boolean("inside", False)
         moved, belt = t.optional("motion", motion), t.vector("surface_velocity", None)
         times = window(t)
 
         def make(site: Site) -> Callable:
+            """The wall itself."""
             shape, center = shaped(site)
             return Collider(
                 Complement(shape) if hollow else shape,
@@ -151,6 +155,7 @@ def _along(shape: Callable[..., AbstractShape]) -> Callable[[Table], Callable[[S
     """The reader of a shape around a segment (`start` and `end` of a wall are times)."""
 
     def read(t: Table) -> Callable[[Site], _Body]:
+        """The shape of a table."""
         first, last = t.vector("from"), t.vector("to")
         if first == last:
             raise t.error("to", "differ from `from`")
@@ -162,13 +167,14 @@ def _along(shape: Callable[..., AbstractShape]) -> Callable[[Table], Callable[[S
 
 def _mesh(t: Table) -> Callable[[Site], _Body]:
     file, scale = t.existing_path("file"), t.number("scale", 1.0, above=0)
-    spacing, position = t.number("spacing", None, above=0), np.asarray(t.vector("position", ZERO))
+    turn, position = rotation_vector(rotation(t)), as_float_array(t.vector("position", ZERO))
+    spacing = t.number("spacing", None, above=0)
 
     def sampled(site: Site) -> _Body:
+        """The mesh on a lattice as fine as the grid, unless the table says how fine."""
         with _libigl(t):
-            body = sample_mesh(file, spacing=spacing or site.spacing, scale=scale)
-        origin = np.asarray(body.origin) + position
-        return _sampled(SampledSDF(origin, body.spacing, body.values))
+            body = sample_mesh(file, spacing=spacing or site.spacing, scale=scale, turn=turn)
+        return _sampled(eqx.tree_at(lambda b: b.origin, body, body.origin + position))
 
     return sampled
 
@@ -179,6 +185,7 @@ def _surroundings(t: Table) -> Callable[[Site], _Body]:
     thickness = t.number("thickness", None, at_least=0)
 
     def sampled(site: Site) -> _Body:
+        """The still Gaussians near the grid as a wall."""
         fine = spacing or site.spacing
         ball = 2 * site.spacing if radius is None else radius
         x = site.surroundings
@@ -187,7 +194,7 @@ def _surroundings(t: Table) -> Callable[[Site], _Body]:
         if not near.any():
             raise SceneError(
                 f"{t.name}: `type` must be another, since no Gaussian that does not move is in the "
-                f"grid."
+                f"grid (`surroundings = false` of a model removes them)."
             )
         with _libigl(t):
             body = sample_points(x[near], spacing=fine, radius=ball, thickness=thickness)
@@ -197,7 +204,7 @@ def _surroundings(t: Table) -> Callable[[Site], _Body]:
 
 
 def _sampled(body: SampledSDF) -> _Body:
-    middle = (np.asarray(body.values.shape) - 1) / 2 * float(body.spacing)
+    middle = (np.asarray(body.coefficients.shape) - 1) / 2 * float(body.spacing)
     return _Body(body, np.asarray(body.origin) + middle)
 
 
