@@ -203,6 +203,7 @@ def _info(options: argparse.Namespace) -> int:
     print(f"threads    {os.cpu_count()}")
     double = jnp.zeros(()).dtype == jnp.float64
     print(f"precision  {'double' if double else 'single'} (JAX_ENABLE_X64)")
+    print(f"native     {_native()}")
     print(f"cache      {os.environ['JAX_COMPILATION_CACHE_DIR']}")
     print(f"presets    {', '.join(presets())}")
     version = metadata.version("jaxlib")
@@ -212,6 +213,22 @@ def _info(options: argparse.Namespace) -> int:
             "XLA_FLAGS=--xla_backend_extra_options=-nvptx-allow-ftz-atomics"
         )
     return 0
+
+
+def _native() -> str:
+    """Which kernels a CPU will run; compiles them if they are not there yet."""
+    import jax.numpy as jnp
+
+    from pgjax import native
+
+    if not native.enabled():
+        return "no (PGJAX_NATIVE=0)"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        library = native.library("transfer", jnp.zeros(()).dtype.name)
+    if library is None:
+        return "no: " + "; ".join(str(w.message) for w in caught)
+    return f"{library.path} ({native.compiler()})"
 
 
 def _use_compilation_cache() -> None:

@@ -14,7 +14,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 
+from pgjax import native
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Matrix3, Scalar, Vector3
 
@@ -60,14 +63,20 @@ def _jacobi_sweep(_: Array, carry: tuple[Matrix3, Matrix3]) -> tuple[Matrix3, Ma
 def eigenbasis(A: Matrix3) -> tuple[Vector3, Matrix3]:
     """Eigenvalues, largest first, and eigenvectors (columns) of a symmetric matrix.
 
-    Cyclic Jacobi, in scalars, so that `vmap` turns it into vector instructions. The result
-    carries **no derivative**: pass it to `spectral_map`, which has the exact one.
+    Cyclic Jacobi, in scalars, so that `vmap` turns it into vector instructions; on a CPU by a
+    native kernel. The result carries **no derivative**: pass it to `spectral_map`, which has the
+    exact one.
 
     Returns:
         `w (3,)` and `Q (3, 3)` with `A = Q diag(w) Qᵀ`, error about 1e-6 (float32) or
         1e-15 (float64) of the largest eigenvalue. `Q` may be a reflection.
     """
-    A = jax.lax.stop_gradient(A)
+    w, Q = eigenbasis_p.bind(jax.lax.stop_gradient(A))
+    return w, Q
+
+
+def _eigenbasis(A: Matrix3) -> tuple[Vector3, Matrix3]:
+    """The same in plain JAX."""
     scale = jnp.max(jnp.abs(A))
     scale = jnp.where(scale > 0, scale, 1)
     # A loop, not unrolled: unrolled, XLA's fusion recomputes earlier sweeps many times over.
@@ -82,6 +91,42 @@ def eigenbasis(A: Matrix3) -> tuple[Vector3, Matrix3]:
         for row in q:
             row[i], row[j] = jnp.where(swap, row[j], row[i]), jnp.where(swap, row[i], row[j])
     return jnp.stack(w) * scale, jnp.stack([jnp.stack(row) for row in q])
+
+
+def _eigenbases(A: Float[Array, "*n 3 3"]) -> tuple[Array, Array]:
+    """`_eigenbasis` over any leading axes."""
+    one = _eigenbasis
+    for _ in A.shape[:-2]:
+        one = jax.vmap(one)
+    return one(A)
+
+
+def _native_eigenbases(A: Float[Array, "*n 3 3"]) -> tuple[Array, Array]:
+    """The same by the native kernel, if there is one."""
+    library = native.library("eigen", jnp.dtype(A.dtype).name)
+    if library is None:
+        return _eigenbases(A)
+    flat = A.reshape(-1, 3, 3)
+    returned = [jax.ShapeDtypeStruct(shape, A.dtype) for shape in (flat.shape[:2], flat.shape)]
+    w, Q = jax.ffi.ffi_call(library.targets["eigenbasis"], returned)(flat)
+    return w.reshape(A.shape[:-1]), Q.reshape(A.shape)
+
+
+def _eigenbasis_batch(operands: tuple[Array], axes: tuple[int]) -> tuple[list[Array], list[int]]:
+    return eigenbasis_p.bind(jnp.moveaxis(operands[0], axes[0], 0)), [0, 0]
+
+
+eigenbasis_p = Primitive("pgjax_eigenbasis")
+eigenbasis_p.multiple_results = True
+eigenbasis_p.def_impl(functools.partial(native.run, eigenbasis_p))
+eigenbasis_p.def_abstract_eval(
+    lambda A: [native.result_type(A, A.shape[:-1]), native.result_type(A, A.shape)]
+)
+batching.primitive_batchers[eigenbasis_p] = _eigenbasis_batch
+mlir.register_lowering(eigenbasis_p, mlir.lower_fun(_eigenbases, multiple_results=True))
+mlir.register_lowering(
+    eigenbasis_p, mlir.lower_fun(_native_eigenbases, multiple_results=True), platform="cpu"
+)
 
 
 @jax.custom_jvp

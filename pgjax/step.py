@@ -137,11 +137,7 @@ def _particles_to_grid(
     to_B, to_S = scene.scheme.split(flux, scene.D)
     B = mass[:, :, None] * C
     B = B if to_B is None else B + to_B
-    payload = Payload(
-        jnp.concatenate([mass * v, mass], axis=1),
-        _with_mass_row(B),
-        None if to_S is None else _with_mass_row(to_S),
-    )
+    payload = Payload(jnp.concatenate([mass * v, mass], axis=1), B, to_S)
     sums = scatter(scene.grid, at, payload)
     grid_mass, momentum = sums[..., d:], sums[..., :d]
     return grid_mass, safe_divide(momentum, jnp.broadcast_to(grid_mass, momentum.shape))
@@ -168,10 +164,8 @@ def _grid_to_particles(
     scene: Scene, at: Stencil, grid_v: Float[Array, "*grid d"]
 ) -> tuple[Float[Array, "p d"], Float[Array, "p d d"], Float[Array, "p d d"]]:
     """`v = Σ w v_i`, `C = Σ w v_i (x_i − x_p)ᵀ/D` and the gradient L that deforms (eq. 3)."""
-    v, moment, slope = gather(scene.grid, at, grid_v)
-    # Divided by h twice: the rounding of h² would bias C, and with it L, at every step. The
-    # barrier keeps the compiler from merging the divisions.
-    C = jax.lax.optimization_barrier(moment / scene.spline.moment / scene.grid.h) / scene.grid.h
+    v, moment, slope = gather(scene.grid, at, grid_v, slope=scene.scheme.needs_slope)
+    C = moment / scene.spline.moment / scene.grid.h
     L = scene.scheme.velocity_gradient(C, slope)
     return v, C, L
 
@@ -258,8 +252,3 @@ def _embed(A: Float[Array, "p d d"]) -> Float[Array, "p 3 3"]:
     """A 2×2 tensor as the upper corner of a 3×3 one (plane strain); 3×3 unchanged."""
     missing = 3 - A.shape[-1]
     return jnp.pad(A, ((0, 0), (0, missing), (0, missing))) if missing else A
-
-
-def _with_mass_row(B: Float[Array, "p d d"]) -> Float[Array, "p c d"]:
-    """Add the channel of the mass, which has no gradient."""
-    return jnp.pad(B, ((0, 0), (0, 1), (0, 0)))

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from pgjax import native
 from pgjax._types import is_parameter
 from pgjax.models import Material
 from pgjax.scene import Scene
@@ -75,16 +76,19 @@ class Memory(NamedTuple):
 def needed_memory(scene: Scene, state: State) -> Memory:
     """What the simulation takes, without drawing and without derivatives.
 
-    The state is there three times: before the frame, after it, and between two steps. The grid
-    has mass, momentum and one more number at each node. Of each particle the transfers hold its
-    window of nodes, three rows of weights for each node of a direction, and its payload.
+    The state is there three times: before the frame, after it, and between two steps. Native
+    transfers hold four numbers at each node, before and after the forces, and the payload of each
+    particle. In plain JAX a node has mass, momentum and one more number, and a particle its window
+    of nodes and three rows of weights for each node of a direction, too.
     """
     d, k, number = scene.grid.dimension, scene.spline.width, state.dtype.itemsize
-    particle = k**d * (d + 1) + 3 * k * d + (d + 1) * (1 + 2 * d)
+    particle, node = d + 1 + 2 * d * d + d, 8
+    if not native.available():
+        particle, node = k**d * (d + 1) + 3 * k * d + (d + 1) * (1 + 2 * d), d + 2
     return Memory(
         scene=_bytes(scene),
         state=3 * _bytes(state),
-        grid=math.prod(scene.grid.padded_shape) * (d + 2) * number,
+        grid=math.prod(scene.grid.padded_shape) * node * number,
         transfers=scene.particle_count * particle * number,
     )
 

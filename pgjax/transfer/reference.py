@@ -1,83 +1,34 @@
 """The two transfers in plain JAX: every platform, every transformation.
 
-Both come from one bilinear form. With a payload `(a, B, S)` per particle and values g per node,
+Both come from one multilinear form. In units of cells, with a payload `(a, B, S)` per particle
+and values g per node,
 
     Φ = Σ_p Σ_i g_i · [ w_ip (a_p + B_p (x_i − x_p)) + S_p ∇w_ip ],
 
-`scatter` is ∂Φ/∂g and `gather` is ∂Φ/∂(a, B, S): each is the other's transpose.
+`scatter` is ∂Φ/∂g and `gather` is ∂Φ/∂(a, B, S): each is the other's transpose. Only the first m
+of the c channels have a gradient B, S. S may be left out: its last axis then has length 0.
 """
 
 import functools
-from typing import final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from pgjax._types import Array, Bool, Float, Int
-from pgjax.grid import PAD, Grid
+from pgjax._types import Array, Float, Int
+from pgjax.grid import PAD
 from pgjax.splines import BSpline
 
 
-@final
-class Payload(eqx.Module):
-    """What each particle sends to its nodes, c channels.
-
-    Args:
-        a: value, `(p, c)`.
-        B: its gradient, `(p, c, d)`: node i receives `w (a + B (x_i − x_p))`.
-        S: flux, `(p, c, d)`: node i receives `S ∇w`. None where no law needs it.
-    """
-
-    a: Float[Array, "p c"]
-    B: Float[Array, "p c d"]
-    S: Float[Array, "p c d"] | None
-
-
-@final
-class Stencil(eqx.Module):
-    """The nodes around each particle, and the spline there.
-
-    Args:
-        first: index of the first node in the padded array, `(p, d)`.
-        w: weights, one row per node and direction, `(p, k, d)`.
-        dw: ∇w along each direction, 1/m.
-        dx: `x_i − x_p`, m.
-    """
-
-    first: Int[Array, "*p d"]
-    w: Float[Array, "*p k d"]
-    dw: Float[Array, "*p k d"]
-    dx: Float[Array, "*p k d"]
-
-
 def stencil(
-    grid: Grid, spline: BSpline, x: Float[Array, "p d"]
-) -> tuple[Stencil, Bool[Array, " p"]]:
-    """The stencil of each particle, and whether it fits in the grid.
-
-    A particle whose stencil does not fit gets the one of the grid's centre: the caller sets its
-    payload to zero. No index is ever out of range.
-
-    Args:
-        grid: the grid.
-        spline: the spline.
-        x: positions relative to the grid's origin, m.
-    """
-    centre = jnp.asarray(grid.shape, x.dtype) / 2
-    node = jnp.arange(spline.width, dtype=x.dtype)
-
-    def of_one(x: Float[Array, " d"]) -> tuple[Stencil, Bool[Array, ""]]:
-        xi = grid.cells(x)
-        inside = grid.contains(spline.base(xi), spline.width)
-        xi = jnp.where(inside, xi, centre)
-        base = jax.lax.stop_gradient(spline.base(xi))
-        offset = xi - base
-        w, dw = spline.weights(offset)
-        dx = (node[:, None] - offset[None, :]) * grid.h
-        return Stencil(base.astype(jnp.int32) + PAD, w, dw / grid.h, dx), inside
-
-    return jax.vmap(of_one)(x)
+    degree: int, xi: Float[Array, " d"]
+) -> tuple[Int[Array, " d"], Float[Array, "k d"], Float[Array, "k d"], Float[Array, "k d"]]:
+    """First node in the padded array; `w`, `∇w` and `x_i − x_p` at the nodes, one row per node."""
+    spline = BSpline(degree)
+    base = jax.lax.stop_gradient(spline.base(xi))
+    offset = xi - base
+    w, dw = spline.weights(offset)
+    dx = jnp.arange(spline.width, dtype=xi.dtype)[:, None] - offset[None, :]
+    return base.astype(jnp.int32) + PAD, w, dw, dx
 
 
 def _outer(rows: list[Float[Array, " k"]]) -> Array:
@@ -93,10 +44,11 @@ def _node_values(
     w: Float[Array, "k d"],
     dw: Float[Array, "k d"],
     dx: Float[Array, "k d"],
-    payload: tuple[Float[Array, " c"], Float[Array, "c d"], Float[Array, "c d"] | None],
+    a: Float[Array, " c"],
+    B: Float[Array, "c d"],
+    S: Float[Array, "c _"],
 ) -> Array:
     """`w (a + B (x_i − x_p)) + S ∇w` at the nodes of one particle, `(k, …, k, c)`."""
-    a, B, S = payload
     d = w.shape[1]
     rows = [w[:, i] for i in range(d)]
 
@@ -109,31 +61,36 @@ def _node_values(
     ones = [jnp.ones_like(row) for row in rows]
     affine = channels(a) + sum(along(j, dx[:, j], ones) * channels(B[:, j]) for j in range(d))
     values = _outer(rows)[..., None] * affine
-    if S is not None:
+    if S.shape[1]:
         values = values + sum(along(j, dw[:, j], rows) * channels(S[:, j]) for j in range(d))
     return values
 
 
-def scatter(grid: Grid, at: Stencil, payload: Payload) -> Float[Array, "*grid c"]:
+def scatter(
+    xi: Float[Array, "p d"],
+    a: Float[Array, "p c"],
+    B: Float[Array, "p m d"],
+    S: Float[Array, "p m _"],
+    *,
+    degree: int,
+    nodes: tuple[int, ...],
+) -> Float[Array, "*nodes c"]:
     """P2G: the sum over particles of `w (a + B (x_i − x_p)) + S ∇w` at every node."""
-    d, c = grid.dimension, payload.a.shape[1]
-    values = jax.vmap(_node_values)(at.w, at.dw, at.dx, (payload.a, payload.B, payload.S))
+    d, c = xi.shape[1], a.shape[1]
+    # Channels without a gradient: that of the mass.
+    B, S = (jnp.pad(m, ((0, 0), (0, c - m.shape[1]), (0, 0))) for m in (B, S))
+    first, w, dw, dx = jax.vmap(functools.partial(stencil, degree))(xi)
+    values = jax.vmap(_node_values)(w, dw, dx, a, B, S)
     # One window per particle. Without the barrier XLA fuses the arithmetic into the scatter's
     # inner loop, which costs a third more.
-    first, values = jax.lax.optimization_barrier((at.first, values))
+    first, values = jax.lax.optimization_barrier((first, values))
     dimensions = jax.lax.ScatterDimensionNumbers(
         update_window_dims=tuple(range(1, d + 2)),
         inserted_window_dims=(),
         scatter_dims_to_operand_dims=tuple(range(d)),
     )
-    padded = jax.lax.scatter_add(
-        jnp.zeros((*grid.padded_shape, c), values.dtype),
-        first,
-        values,
-        dimensions,
-        mode="promise_in_bounds",
-    )
-    return grid.fold(padded)
+    start = jnp.zeros((*nodes, c), values.dtype)
+    return jax.lax.scatter_add(start, first, values, dimensions, mode="promise_in_bounds")
 
 
 def _contract(row: Float[Array, " k"], window: Array) -> Array:
@@ -155,21 +112,31 @@ def _moments(
 
 
 def gather(
-    grid: Grid, at: Stencil, values: Float[Array, "*grid c"]
-) -> tuple[Float[Array, "p c"], Float[Array, "p c d"], Float[Array, "p c d"]]:
-    """G2P: `Σ w g`, `Σ w g (x_i − x_p)ᵀ` and `Σ g ∇wᵀ` for every particle."""
-    d, k, c = grid.dimension, at.w.shape[1], values.shape[-1]
+    xi: Float[Array, "p d"],
+    g: Float[Array, "*nodes c"],
+    *,
+    degree: int,
+    graded: int,
+    slope: bool,
+) -> tuple[Float[Array, "p c"], Float[Array, "p m d"], Float[Array, "p m _"]]:
+    """G2P: `Σ w g`, `Σ w g (x_i − x_p)ᵀ` and, with `slope`, `Σ g ∇wᵀ` for every particle.
+
+    Args:
+        xi: positions in cells.
+        g: values of the nodes.
+        degree: of the spline.
+        graded: m, the number of channels whose gradients are wanted.
+        slope: whether the last of the three is wanted.
+    """
+    d, k, c = xi.shape[1], degree + 1, g.shape[-1]
+    first, w, dw, dx = jax.vmap(functools.partial(stencil, degree))(xi)
     dimensions = jax.lax.GatherDimensionNumbers(
         offset_dims=tuple(range(1, d + 2)),
         collapsed_slice_dims=(),
         start_index_map=tuple(range(d)),
     )
-    windows = jax.lax.gather(
-        grid.unfold(values),
-        at.first,
-        dimensions,
-        slice_sizes=(*(k,) * d, c),
-        mode="promise_in_bounds",
-    )
+    sizes = (*(k,) * d, c)
+    windows = jax.lax.gather(g, first, dimensions, slice_sizes=sizes, mode="promise_in_bounds")
     windows = jax.lax.optimization_barrier(windows)
-    return jax.vmap(_moments)(at.w, at.dw, at.dx, windows)
+    value, moment, slopes = jax.vmap(_moments)(w, dw, dx, windows)
+    return value, moment[:, :graded], slopes[:, :graded, : d if slope else 0]

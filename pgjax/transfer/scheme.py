@@ -16,8 +16,13 @@ Flux = Float[Array, "p d d"]
 class AbstractScheme(eqx.Module):
     """An APIC scheme."""
 
+    @property
+    def needs_slope(self) -> bool:
+        """Whether `velocity_gradient` looks at `slope`; if not, it is not computed."""
+        return True
+
     @abc.abstractmethod
-    def velocity_gradient(self, C: Flux, slope: Flux) -> Flux:
+    def velocity_gradient(self, C: Flux, slope: Flux | None) -> Flux:
         """The L that deforms a particle, from `C` and from `Σ v_i ∇wᵀ`."""
 
     @abc.abstractmethod
@@ -42,9 +47,10 @@ class AbstractScheme(eqx.Module):
 class SplineGradient(AbstractScheme):
     """The original MPM: `L = Σ v_i ∇wᵀ`, force `−Σ V⁰ τ ∇w` (Sulsky 1994; Jiang et al. 2016)."""
 
-    def velocity_gradient(self, C: Flux, slope: Flux) -> Flux:
+    def velocity_gradient(self, C: Flux, slope: Flux | None) -> Flux:
         """`Σ v_i ∇wᵀ`."""
         del C
+        assert slope is not None
         return slope
 
     def split(self, flux: Flux, D: Float[Array, ""]) -> tuple[Flux | None, Flux | None]:
@@ -64,7 +70,12 @@ class MLS(AbstractScheme):
     Its stable time step is 1.41 (quadratic) times the one of `SplineGradient`.
     """
 
-    def velocity_gradient(self, C: Flux, slope: Flux) -> Flux:
+    @property
+    def needs_slope(self) -> bool:
+        """No: L is C."""
+        return False
+
+    def velocity_gradient(self, C: Flux, slope: Flux | None) -> Flux:
         """The affine velocity C itself."""
         del slope
         return C

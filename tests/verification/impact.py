@@ -160,12 +160,8 @@ def _free_velocity(s: pgjax.Scene, state: pgjax.State, at, dt) -> tuple[jax.Arra
     ]
     mass = s.masses[:, None]
     flux = -dt * s.volumes[:, None, None] * jnp.concatenate(stress)[:, :2, :2]
-    no_mass = [(0, 0), (0, 1), (0, 0)]
-    payload = Payload(
-        jnp.concatenate([mass * state.v, mass], axis=1),
-        jnp.pad(mass[:, :, None] * state.C, no_mass),
-        jnp.pad(flux, no_mass),
-    )
+    momentum = jnp.concatenate([mass * state.v, mass], axis=1)
+    payload = Payload(momentum, mass[:, :, None] * state.C, flux)
     sums = scatter(s.grid, at, payload)
     m, momentum = sums[..., 2:], sums[..., :2]
     return m, momentum / jnp.where(m > 0, m, 1) + (dt * s.gravity)[None, None, :]

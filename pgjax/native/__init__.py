@@ -1,0 +1,184 @@
+"""Kernels in C++ for CPUs, called by XLA: compiled on first use, kept in a cache.
+
+The cache is `$PGJAX_CACHE_DIR`, else `$XDG_CACHE_HOME/pgjax`, else `~/.cache/pgjax`. A library is
+found by what it was made from (sources, options, compiler, jaxlib, CPU) and loaded only if its
+contents are those that were written, so one from another machine or version is never used.
+Without a compiler, or with `PGJAX_NATIVE=0`, everything runs in plain JAX.
+"""
+
+import ctypes
+import dataclasses
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+import threading
+import warnings
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.sharding import NamedSharding, PartitionSpec
+
+# What each source holds.
+HANDLERS = {
+    "transfer": ("scatter", "scatter_tangent", "gather", "gather_tangent", "pull"),
+    "eigen": ("eigenbasis",),
+}
+_OPTIONS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fPIC", "-shared")
+_COMPILERS = ("c++", "g++", "clang++")
+_HERE = Path(__file__).parent
+_lock = threading.Lock()
+
+
+class NativeWarning(UserWarning):
+    """The native kernels cannot be used; results are the same, only slower."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Library:
+    """A loaded library: which targets XLA knows its handlers by, and where it lies."""
+
+    path: Path
+    targets: dict[str, str]
+
+
+def library(source: str, dtype: str, dimension: int = 3) -> Library | None:
+    """The kernels of a source ("transfer", "eigen") for "float32" or "float64"; None without."""
+    if not enabled() or dtype not in ("float32", "float64"):
+        return None
+    with _lock:
+        return _library(source, dtype, dimension)
+
+
+def enabled() -> bool:
+    """Whether native kernels are wanted: unless `PGJAX_NATIVE=0`."""
+    return os.environ.get("PGJAX_NATIVE", "1") != "0"
+
+
+def available() -> bool:
+    """Whether they will be used: wanted, on a CPU, and there is a compiler (not yet tried)."""
+    return enabled() and compiler() is not None and jax.default_backend() == "cpu"
+
+
+def cache_folder() -> Path:
+    """Where compiled libraries are kept."""
+    if own := os.environ.get("PGJAX_CACHE_DIR"):
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "pgjax"
+
+
+@functools.cache
+def compiler() -> str | None:
+    """The C++ compiler: `$CXX`, or the first of c++, g++, clang++ that is installed."""
+    for name in (os.environ.get("CXX"), *_COMPILERS):
+        if name and (found := shutil.which(name)):
+            return found
+    return None
+
+
+@functools.cache
+def _library(source: str, dtype: str, dimension: int) -> Library | None:
+    found = compiler()
+    if found is None:
+        _warn("no C++ compiler was found (install g++ or clang++, or set CXX)")
+        return None
+    options = (*_OPTIONS, f"-DPGJAX_D={dimension}")
+    if dtype == "float64":
+        options = (*options, "-DPGJAX_DOUBLE")
+    try:
+        key = _key(found, options, source)
+        path = _built(found, options, source, key)
+        handlers = ctypes.CDLL(str(path))
+    except (OSError, subprocess.SubprocessError) as error:
+        detail = getattr(error, "stderr", None) or str(error)
+        _warn(f"compiling them with {found} failed: {detail.strip()[-500:]}")
+        return None
+    targets = {}
+    for name in HANDLERS[source]:
+        # The key is part of the name: a program that JAX kept in its cache never meets a kernel
+        # other than its own.
+        targets[name] = f"pgjax_{name}_{dtype}_{dimension}d_{key[:12]}"
+        capsule = jax.ffi.pycapsule(getattr(handlers, f"pgjax_{name}"))
+        jax.ffi.register_ffi_target(targets[name], capsule, platform="cpu")
+    return Library(path, targets)
+
+
+@functools.cache
+def _warn(reason: str) -> None:
+    """Once, although there are several libraries."""
+    warnings.warn(
+        f"pgjax runs in plain JAX, several times slower: {reason}. "
+        f"Set PGJAX_NATIVE=0 to do so without this message.",
+        NativeWarning,
+        stacklevel=2,
+    )
+
+
+def _key(found: str, options: tuple[str, ...], source: str) -> str:
+    """A digest of everything the machine code depends on."""
+    digest = hashlib.sha256()
+    made_by = subprocess.run([found, "--version"], capture_output=True, check=True).stdout
+    facts = (*options, version("jaxlib"), platform.machine(), platform.system(), _cpu())
+    for fact in (made_by, *(f.encode() for f in facts)):
+        digest.update(fact + b"\0")
+    for name in ("parallel.h", "xla.h", f"{source}.h", f"{source}.cc"):
+        digest.update((_HERE / name).read_bytes())
+    return digest.hexdigest()
+
+
+def _cpu() -> str:
+    """Model and instruction sets of the CPU, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor()
+    return "\n".join(line for line in lines if line.startswith(("model name", "flags", "Features")))
+
+
+def _built(found: str, options: tuple[str, ...], source: str, key: str) -> Path:
+    """The library for a key: from the cache if it is whole, else compiled into it."""
+    folder = cache_folder()
+    path, seal = folder / f"{key}.so", folder / f"{key}.sha256"
+    if path.is_file() and seal.is_file() and seal.read_text() == _contents(path):
+        return path
+    folder.mkdir(parents=True, exist_ok=True)
+    # Built beside its place and moved there whole: other processes may do the same just now.
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        new = Path(scratch) / path.name
+        code = str(_HERE / f"{source}.cc")
+        command = [found, *options, f"-I{jax.ffi.include_dir()}", code, "-o", str(new)]
+        subprocess.run(command, capture_output=True, text=True, check=True)
+        mark = Path(scratch) / seal.name
+        mark.write_text(_contents(new))
+        os.replace(new, path)
+        os.replace(mark, seal)
+    return path
+
+
+def _contents(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def result_type(like: ShapedArray, shape: tuple[int, ...]) -> ShapedArray:
+    """The type of a result: that of an operand but for its shape, inside `shard_map` too."""
+    spec = PartitionSpec(*(None,) * len(shape))
+    return like.update(shape=shape, sharding=NamedSharding(like.sharding.mesh, spec))
+
+
+def run(primitive: Primitive, *operands: Any, **static: Any) -> Any:
+    """Run a primitive outside of `jit`."""
+    return _compiled(primitive, tuple(sorted(static.items())))(*operands)
+
+
+@functools.cache
+def _compiled(primitive: Primitive, static: tuple[tuple[str, Any], ...]) -> Callable[..., Any]:
+    return jax.jit(functools.partial(primitive.bind, **dict(static)))

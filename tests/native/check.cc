@@ -1,0 +1,182 @@
+// Runs the kernels without JAX: with 1, 2, 3 and 8 threads, with particles outside of the array
+// and with NaN. Exits with 1 where results depend on the number of threads, or where a particle
+// outside takes part. `tests/native/sanitize.sh` runs it under the sanitizers.
+#include <cstdio>
+#include <limits>
+#include <random>
+#include <thread>
+
+#include "eigen.h"
+#include "transfer.h"
+
+using namespace pgjax;
+
+namespace {
+
+// Threads that take tasks from a list, like those of XLA.
+class Threads {
+ public:
+  explicit Threads(int n) {
+    for (int i = 0; i < n; ++i) threads_.emplace_back([this] { serve(); });
+  }
+  ~Threads() {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      closed_ = true;
+    }
+    changed_.notify_all();
+    for (auto& t : threads_) t.join();
+  }
+  Pool pool() {
+    return Pool(std::int64_t(threads_.size()) + 1, [this](std::function<void()> task) {
+      {
+        std::lock_guard<std::mutex> lock(mutex_);
+        tasks_.push_back(std::move(task));
+      }
+      changed_.notify_one();
+    });
+  }
+
+ private:
+  void serve() {
+    for (;;) {
+      std::function<void()> task;
+      {
+        std::unique_lock<std::mutex> lock(mutex_);
+        changed_.wait(lock, [this] { return closed_ || !tasks_.empty(); });
+        if (tasks_.empty()) return;
+        task = std::move(tasks_.back());
+        tasks_.pop_back();
+      }
+      task();
+    }
+  }
+  std::mutex mutex_;
+  std::condition_variable changed_;
+  bool closed_ = false;
+  std::vector<std::function<void()>> tasks_;
+  std::vector<std::thread> threads_;
+};
+
+template <class T>
+using Numbers = std::vector<T>;
+
+template <class T>
+Batched<const T> in(const Numbers<T>& a, Index batch) {
+  return {a.data(), batch > 1 ? Index(a.size()) / batch : 0};
+}
+template <class T>
+Batched<T> out(Numbers<T>& a, Index batch) {
+  return {a.data(), Index(a.size()) / batch};
+}
+
+// Everything the kernels compute, one after the other.
+template <class T, int D, int K, bool HasS>
+Numbers<T> run(Index particles, Index batch, const Numbers<T>& xi, Pool& pool) {
+  Shape<D> shape;
+  shape.particles = particles, shape.c = D + 1, shape.m = D;
+  for (int i = 0; i < D; ++i) shape.nodes[i] = 29 + i;
+  std::mt19937 random(7);
+  std::normal_distribution<T> normal;
+  const auto drawn = [&](Index n) {
+    Numbers<T> a(n);
+    for (T& v : a) v = normal(random);
+    return a;
+  };
+  const Index n = batch * particles, s = HasS ? D : 0, nodes = shape.node_count() * kChannels;
+  const auto a = drawn(n * (D + 1)), B = drawn(n * D * D), S = drawn(n * D * s);
+  const auto da = drawn(n * (D + 1)), dB = drawn(n * D * D), dS = drawn(n * D * s);
+  const auto dxi = drawn(n * D), g = drawn(batch * nodes), dg = drawn(batch * nodes);
+  const Payload<T> payload{in(a, batch), in(B, batch), in(S, batch)};
+  const Payload<T> moved{in(da, batch), in(dB, batch), in(dS, batch)};
+  Numbers<T> all;
+  const auto keep = [&](const Numbers<T>& v) { all.insert(all.end(), v.begin(), v.end()); };
+
+  Numbers<T> sums(batch * nodes), ra(a.size()), rB(B.size()), rS(S.size()), rx(xi.size());
+  const Moments<T> moments{out(ra, batch), out(rB, batch), out(rS, batch)};
+  scatter<T, D, K, HasS>(shape, batch, in(xi, batch), payload, out(sums, batch), pool);
+  keep(sums);
+  scatter_tangent<T, D, K, HasS>(shape, batch, in(xi, batch), payload, in(dxi, batch), moved,
+                                 out(sums, batch), pool);
+  keep(sums);
+  gather<T, D, K, HasS>(shape, batch, in(xi, batch), in(g, batch), moments, pool);
+  keep(ra), keep(rB), keep(rS);
+  gather_tangent<T, D, K, HasS>(shape, batch, in(xi, batch), in(g, batch), in(dxi, batch),
+                                in(dg, batch), moments, pool);
+  keep(ra), keep(rB), keep(rS);
+  pull<T, D, K, HasS>(shape, batch, in(xi, batch), payload, in(g, batch), out(rx, batch), moments,
+                      pool);
+  keep(rx), keep(ra), keep(rB), keep(rS);
+  return all;
+}
+
+template <class T, int D, int K, bool HasS>
+bool check(Index particles, Index batch) {
+  std::mt19937 random(3);
+  std::uniform_real_distribution<T> anywhere(0, 24);
+  Numbers<T> xi(batch * particles * D);
+  for (T& v : xi) v = anywhere(random);
+  // Some leave the array a little, some by far, some are not numbers.
+  const T bad[] = {T(-2.6), T(27.9), T(1e30), T(-1e30), T(NAN), T(INFINITY), T(-INFINITY)};
+  for (std::size_t i = 0; i < xi.size(); i += 97) xi[i] = bad[(i / 97) % 7];
+
+  Pool alone;
+  const auto expected = run<T, D, K, HasS>(particles, batch, xi, alone);
+  for (T v : expected)
+    if (!std::isfinite(v)) return std::printf("not finite\n"), false;
+  for (int threads : {2, 3, 8}) {
+    Threads more(threads - 1);
+    Pool pool = more.pool();
+    const auto got = run<T, D, K, HasS>(particles, batch, xi, pool);
+    if (got.size() != expected.size() ||
+        std::memcmp(got.data(), expected.data(), got.size() * sizeof(T)))
+      return std::printf("%d threads differ\n", threads), false;
+  }
+  return true;
+}
+
+template <class T, int D>
+bool check_dimension() {
+  return check<T, D, 3, true>(3000, 1) && check<T, D, 4, true>(3000, 1) &&
+         check<T, D, 3, false>(700, 5) && check<T, D, 4, false>(1, 1) && check<T, D, 3, true>(0, 1);
+}
+
+// Q diag(w) Q^T is the matrix again, in groups that are full and in the rest of one.
+template <class T>
+bool check_eigen(std::int64_t count) {
+  std::mt19937 random(5);
+  std::normal_distribution<T> normal;
+  Numbers<T> A(count * 9), w(count * 3), Q(count * 9);
+  for (std::int64_t p = 0; p < count; ++p)
+    for (int i = 0; i < 3; ++i)
+      for (int j = i; j < 3; ++j)
+        A[9 * p + 3 * i + j] = A[9 * p + 3 * j + i] = p % 7 == 3 ? T(i == j) : normal(random);
+  Threads more(2);
+  Pool pool = more.pool();
+  eigenbasis<T>(count, A.data(), w.data(), Q.data(), pool);
+  for (std::int64_t p = 0; p < count; ++p)
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) {
+        T sum = 0;
+        for (int k = 0; k < 3; ++k) sum += Q[9 * p + 3 * i + k] * w[3 * p + k] * Q[9 * p + 3 * j + k];
+        if (!(std::fabs(sum - A[9 * p + 3 * i + j]) < 20 * std::numeric_limits<T>::epsilon() * 4))
+          return std::printf("eigenbasis of matrix %d is wrong\n", int(p)), false;
+      }
+  return true;
+}
+
+template <class T>
+bool check_eigen() {
+  for (std::int64_t count : {0, 1, 15, 16, 17, 5000})
+    if (!check_eigen<T>(count)) return false;
+  return true;
+}
+
+}  // namespace
+
+int main() {
+  const bool good = check_eigen<float>() && check_eigen<double>() && check_dimension<float, 2>() && check_dimension<float, 3>() &&
+                    check_dimension<double, 2>() && check_dimension<double, 3>();
+  std::puts(good ? "equal" : "FAILED");
+  return good ? 0 : 1;
+}
