@@ -34,6 +34,8 @@ def test_kernels_outside_of_jax(tmp_path):
 def test_eigenbasis_of_both(monkeypatch):
     """Native and plain: random, equal, opposite and extreme eigenvalues, any batch; NaN stays."""
     monkeypatch.setenv("PGJAX_NATIVE", "1")
+    jax.clear_caches()
+    assert native.library("eigen", jnp.zeros(()).dtype.name) is not None
     rng = np.random.default_rng(0)
     A = rng.normal(size=(5, 7, 3, 3))
     A[0, :3] = np.eye(3), np.zeros((3, 3)), np.diag([1, -1, 1])
@@ -49,6 +51,23 @@ def test_eigenbasis_of_both(monkeypatch):
     back = jnp.einsum("abij,abj,abkj->abik", Q, w, Q)
     assert jnp.all(jnp.abs(back - A) <= 32 * eps * size[..., None, None])
     assert jnp.all(jnp.isnan(jax.jit(linalg.eigenbasis)(jnp.full((3, 3), jnp.nan))[0]))
+
+
+def test_without_jit():
+    """`jax.disable_jit` is how users look into a step."""
+    with jax.disable_jit():
+        w, _ = linalg.eigenbasis(jnp.diag(jnp.asarray([1.0, 3.0, 2.0])))
+    assert np.allclose(w, [3, 2, 1])
+
+
+@needs_compiler
+def test_a_library_that_lacks_a_kernel_is_not_used(monkeypatch):
+    monkeypatch.setenv("PGJAX_NATIVE", "1")
+    monkeypatch.setitem(native.HANDLERS, "eigen", ("eigenbasis", "missing"))
+    native._warn.cache_clear()
+    with pytest.warns(native.NativeWarning, match="pgjax_missing"):
+        assert native._library.__wrapped__("eigen", "float32", 3) is None
+    native._warn.cache_clear()
 
 
 @pytest.fixture
@@ -149,7 +168,7 @@ def outcome(tmp_path, **variables):
     script.write_text(textwrap.dedent(RUN))
     run = subprocess.run(
         [sys.executable, str(script)],
-        env={**os.environ, "PGJAX_CACHE_DIR": str(tmp_path), **variables},
+        env={**os.environ, "PGJAX_NATIVE": "1", "PGJAX_CACHE_DIR": str(tmp_path), **variables},
         capture_output=True,
         text=True,
         check=False,
@@ -169,4 +188,4 @@ def test_without_a_compiler_it_says_so_once(tmp_path):
     failing = shutil.which("false")
     broken, warned = outcome(tmp_path, CXX=str(failing))
     assert broken == wished
-    assert warned.count(f"compiling them with {failing} failed") == 1
+    assert warned.count(f"building or loading them with {failing}") == 1

@@ -35,6 +35,8 @@ def native_kernels():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PGJAX_NATIVE", "1")
         jax.clear_caches()
+        for d in (2, 3):
+            assert native.library("transfer", jnp.dtype(DTYPE).name, d) is not None
         yield
 
 
@@ -203,6 +205,15 @@ def test_batches():
         return jax.vmap(inner, in_axes=(0, None, 0, None))
 
     compare(nested, many.xi, many.payload[0], many.payload[1], case.payload[2])
+
+
+def test_empty_batch():
+    case = Case(2, 2, True)
+
+    def run(of):
+        return jax.vmap(jax.grad(energy(case, of)), in_axes=(0, None, None, None, None))
+
+    compare(run, case.xi[None][:0], *case.payload, case.g)
 
 
 def test_tangents_share_their_primal():

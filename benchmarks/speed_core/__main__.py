@@ -1,9 +1,10 @@
-"""Time of 200 steps of 29 791 particles on a 64³ grid, per material and scheme, in pure JAX.
+"""Time of 200 steps of 29 791 particles on a 64³ grid, per material, scheme and kernels.
 
     python -m benchmarks.speed_core [MATERIAL …]
 
-prints the table and writes `benchmarks/results/speed_core.json` and `.md`. Compilation is timed
-apart; the run is the median of three, after it, blocked until ready.
+prints the table and writes `benchmarks/results/speed_core.json` and `.md`. Plain JAX and native
+kernels take turns in one process. Compilation is timed apart; the run is the median of three,
+after it, blocked until ready.
 """
 
 import json
@@ -18,7 +19,7 @@ import jax
 import numpy as np
 
 import pgjax
-from pgjax import boundary, models, sampling
+from pgjax import boundary, models, native, sampling
 
 STEPS, SIDE, CELLS = 200, 31, 64
 RESULTS = Path(__file__).parent.parent / "results"
@@ -33,6 +34,7 @@ MATERIALS = {
     ),
 }
 SCHEMES = {"spline gradient": pgjax.SplineGradient(), "MLS": pgjax.MLS()}
+KERNELS = ("plain JAX", "native") if native.available() else ("plain JAX",)
 
 
 def setup(material, scheme):
@@ -52,8 +54,10 @@ def setup(material, scheme):
     return scene, pgjax.initial_state(scene, x, (0, 0, -1.0))
 
 
-def measure(material, scheme):
+def measure(material, scheme, kernels):
     """Seconds to compile and to run, and the nanoseconds per particle and step."""
+    os.environ["PGJAX_NATIVE"] = str(int(kernels == "native"))
+    jax.clear_caches()
     scene, state = setup(material, scheme)
     dt = pgjax.stable_dt(scene, state)
 
@@ -83,9 +87,10 @@ def main():
     for name in sys.argv[1:] or MATERIALS:
         material = MATERIALS[name]
         for label, scheme in SCHEMES.items():
-            row = {"material": name, "scheme": label} | measure(material, scheme)
-            rows.append(row)
-            print(row, flush=True)
+            for kernels in KERNELS:
+                row = {"material": name, "scheme": label, "kernels": kernels}
+                rows.append(row | measure(material, scheme, kernels))
+                print(rows[-1], flush=True)
     about = {
         "command": " ".join(["python -m benchmarks.speed_core", *map(repr, sys.argv[1:])]),
         "particles": SIDE**3,
@@ -101,16 +106,16 @@ def main():
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "speed_core.json").write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")
     lines = [
-        "# 200 steps of 29 791 particles on a 64³ grid, pure JAX",
+        "# 200 steps of 29 791 particles on a 64³ grid",
         "",
         f"`{about['command']}`, {about['cores']} CPU cores, float32, JAX {about['jax']}, "
         f"Python {about['python']}. Quadratic APIC, eight particles per cell.",
         "",
-        "| material | scheme | compile, s | run, s | ns per particle and step |",
-        "|---|---|---|---|---|",
+        "| material | scheme | kernels | compile, s | run, s | ns per particle and step |",
+        "|---|---|---|---|---|---|",
         *(
-            f"| {r['material']} | {r['scheme']} | {r['compile_s']} | {r['run_s']} | "
-            f"{r['ns_per_particle_step']} |"
+            f"| {r['material']} | {r['scheme']} | {r['kernels']} "
+            f"| {r['compile_s']} | {r['run_s']} | {r['ns_per_particle_step']} |"
             for r in rows
         ),
     ]

@@ -97,18 +97,20 @@ def _library(source: str, dtype: str, dimension: int) -> Library | None:
     try:
         key = _key(found, options, source)
         path = _built(found, options, source, key)
-        handlers = ctypes.CDLL(str(path))
-    except (OSError, subprocess.SubprocessError) as error:
+        loaded = ctypes.CDLL(str(path))
+        handlers = {name: getattr(loaded, f"pgjax_{name}") for name in HANDLERS[source]}
+    except (OSError, RuntimeError, AttributeError, subprocess.SubprocessError) as error:
         detail = getattr(error, "stderr", None) or str(error)
-        _warn(f"compiling them with {found} failed: {detail.strip()[-500:]}")
+        _warn(
+            f"building or loading them with {found} in the folder PGJAX_CACHE_DIR failed: "
+            f"{detail.strip()[-500:]}"
+        )
         return None
-    targets = {}
-    for name in HANDLERS[source]:
-        # The key is part of the name: a program that JAX kept in its cache never meets a kernel
-        # other than its own.
-        targets[name] = f"pgjax_{name}_{dtype}_{dimension}d_{key[:12]}"
-        capsule = jax.ffi.pycapsule(getattr(handlers, f"pgjax_{name}"))
-        jax.ffi.register_ffi_target(targets[name], capsule, platform="cpu")
+    # The key is part of the name: a program that JAX kept in its cache never meets a kernel other
+    # than its own.
+    targets = {name: f"pgjax_{name}_{dtype}_{dimension}d_{key[:12]}" for name in handlers}
+    for name, handler in handlers.items():
+        jax.ffi.register_ffi_target(targets[name], jax.ffi.pycapsule(handler), platform="cpu")
     return Library(path, targets)
 
 
@@ -126,10 +128,10 @@ def _warn(reason: str) -> None:
 def _key(found: str, options: tuple[str, ...], source: str) -> str:
     """A digest of everything the machine code depends on."""
     digest = hashlib.sha256()
-    made_by = subprocess.run([found, "--version"], capture_output=True, check=True).stdout
+    made_by = _run_compiler([found, "--version"])
     facts = (*options, version("jaxlib"), platform.machine(), platform.system(), _cpu())
-    for fact in (made_by, *(f.encode() for f in facts)):
-        digest.update(fact + b"\0")
+    for fact in (made_by, *facts):
+        digest.update(fact.encode() + b"\0")
     for name in ("parallel.h", "xla.h", f"{source}.h", f"{source}.cc"):
         digest.update((_HERE / name).read_bytes())
     return digest.hexdigest()
@@ -148,7 +150,7 @@ def _built(found: str, options: tuple[str, ...], source: str, key: str) -> Path:
     """The library for a key: from the cache if it is whole, else compiled into it."""
     folder = cache_folder()
     path, seal = folder / f"{key}.so", folder / f"{key}.sha256"
-    if path.is_file() and seal.is_file() and seal.read_text() == _contents(path):
+    if _whole(path, seal):
         return path
     folder.mkdir(parents=True, exist_ok=True)
     # Built beside its place and moved there whole: other processes may do the same just now.
@@ -156,16 +158,27 @@ def _built(found: str, options: tuple[str, ...], source: str, key: str) -> Path:
         new = Path(scratch) / path.name
         code = str(_HERE / f"{source}.cc")
         command = [found, *options, f"-I{jax.ffi.include_dir()}", code, "-o", str(new)]
-        subprocess.run(command, capture_output=True, text=True, check=True)
+        _run_compiler(command)
         mark = Path(scratch) / seal.name
-        mark.write_text(_contents(new))
-        os.replace(new, path)
-        os.replace(mark, seal)
+        mark.write_bytes(_contents(new))
+        # What another process has put there meanwhile may be in use.
+        if not _whole(path, seal):
+            os.replace(new, path)
+            os.replace(mark, seal)
     return path
 
 
-def _contents(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _whole(path: Path, seal: Path) -> bool:
+    return path.is_file() and seal.is_file() and seal.read_bytes() == _contents(path)
+
+
+def _contents(path: Path) -> bytes:
+    return hashlib.sha256(path.read_bytes()).hexdigest().encode()
+
+
+def _run_compiler(command: list[str]) -> str:
+    run = subprocess.run(command, capture_output=True, text=True, errors="replace", check=True)
+    return run.stdout
 
 
 def result_type(like: ShapedArray, shape: tuple[int, ...]) -> ShapedArray:
@@ -175,8 +188,9 @@ def result_type(like: ShapedArray, shape: tuple[int, ...]) -> ShapedArray:
 
 
 def run(primitive: Primitive, *operands: Any, **static: Any) -> Any:
-    """Run a primitive outside of `jit`."""
-    return _compiled(primitive, tuple(sorted(static.items())))(*operands)
+    """Run a primitive outside of `jit`; compiled also where a user has switched that off."""
+    with jax.disable_jit(False):
+        return _compiled(primitive, tuple(sorted(static.items())))(*operands)
 
 
 @functools.cache

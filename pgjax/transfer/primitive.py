@@ -104,7 +104,9 @@ def _define(
         dtype, d = operands[0].dtype, operands[0].shape[-1]
         library = native.library("transfer", jnp.dtype(dtype).name, d)
         wanted = results(*(a.shape for a in operands), **static)
-        if library is None or max(shape[-1] for shape in wanted) > _CHANNELS:
+        # The kernels count particles in 32 bits.
+        unfit = max(shape[-1] for shape in wanted) > _CHANNELS or operands[0].shape[1] >= 2**31
+        if library is None or unfit:
             return plain(*operands, **static)
         operands = tuple(_full(a) if i in nodes_in else a for i, a in enumerate(operands))
         full = [(*shape[:-1], _CHANNELS) if name in _TO_NODES else shape for shape in wanted]
@@ -147,6 +149,14 @@ def _batch(primitive: Primitive, operands: Arrays, axes: Any, **static: Any) -> 
         # Not by -1, which a last axis of length 0 leaves open.
         return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
 
+    if n * inner == 0:
+        one = functools.partial(primitive.bind, **static)
+        single = (
+            a[:1] if axis is None else jnp.zeros_like(a, shape=(1, *a.shape[2:]))
+            for a, axis in zip(moved, axes, strict=True)
+        )
+        shapes = jax.eval_shape(one, *single)
+        return [jnp.zeros((n, inner, *s.shape[1:]), s.dtype) for s in shapes], [0] * len(shapes)
     out = primitive.bind(*map(merged, moved, axes), **static)
     return [o.reshape(n, o.shape[0] // n, *o.shape[1:]) for o in out], [0] * len(out)
 
@@ -273,6 +283,12 @@ ad.primitive_transposes[scatter_p] = _scatter_transpose
 ad.primitive_transposes[gather_p] = _gather_transpose
 ad.primitive_transposes[scatter_tangent_p] = _scatter_tangent_transpose
 ad.primitive_transposes[gather_tangent_p] = _gather_tangent_transpose
+
+
+def _promoted(*operands: Array) -> list[Array]:
+    """All in the highest precision of any."""
+    dtype = functools.reduce(jnp.promote_types, (a.dtype for a in operands))
+    return [a.astype(dtype) for a in operands]
 
 
 def scatter(
