@@ -40,12 +40,14 @@ inline void rotate(V& ii, V& jj, V& off, V& ki, V& kj, V qi[3], V qj[3]) {
   const V tangent = 2 * off / (below > 0 ? below : one);
   const V t = gap < 0 ? -tangent : tangent;
   const V c = 1 / root(1 + t * t), s = t * c;
+  // c u - s v as u - s (v + s/(1 + c) u): only the change is rounded (Rutishauser 1966).
+  const V half = s / (1 + c);
   ii -= t * off, jj += t * off, off = zero;
   const V u = ki, v = kj;
-  ki = c * u - s * v, kj = s * u + c * v;
+  ki = u - s * (v + half * u), kj = v + s * (u - half * v);
   for (int m = 0; m < 3; ++m) {
     const V x = qi[m], y = qj[m];
-    qi[m] = c * x - s * y, qj[m] = s * x + c * y;
+    qi[m] = x - s * (y + half * x), qj[m] = y + s * (x - half * y);
   }
 }
 
