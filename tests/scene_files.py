@@ -27,19 +27,14 @@ E = 2e4
 nu = 0.3
 density = 1000
 """
-DROP = """
+DROP = (
+    """
 name = "drop"
 [model]
 ply = "drop.ply"
-size = 0.5
-[grid]
-lower = [-0.5, -0.5, -0.2]
-upper = [0.5, 0.5, 0.8]
-spacing = 0.1
-[time]
-frames = 3
-fps = 25
-[forces]
+size = 0.5"""
+    + GRID
+    + """[forces]
 gravity = [0, 0, -9.81]
 [[material]]
 law = "fixed-corotated"
@@ -63,6 +58,7 @@ friction = 0.3
 width = 64
 height = 48
 """
+)
 CAMERA = """
 [camera]
 width = 64

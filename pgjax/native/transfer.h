@@ -430,10 +430,11 @@ inline void clear(void* data, Index bytes, Pool& pool) {
   });
 }
 
-// g = sum_p w (a + B r) + S grad w.
-template <class T, int D, int K, bool HasS>
-void scatter(const Shape<D>& shape, Index batch, Batched<const T> xi, const Payload<T>& payload,
-             Batched<T> g, Pool& pool) {
+// Clears the nodes, then calls `one(b, p, offset, node)` for every particle that fits: its place in
+// the cell and the first node of its stencil. No two calls at a time share a node.
+template <class T, int D, int K, class F>
+void scatter_each(const Shape<D>& shape, Index batch, Batched<const T> xi, Batched<T> g, Pool& pool,
+                  const F& one) {
   const auto strides = shape.strides();
   const Index size = shape.node_count() * kChannels;
   for_each_member(batch, pool, [&](Index b, Pool& pool) {
@@ -444,11 +445,20 @@ void scatter(const Shape<D>& shape, Index batch, Batched<const T> xi, const Payl
       Index first[D] = {};
       T offset[D] = {};
       locate<T, D, K>(shape, xi.at(b) + p * D, first, offset);
-      Axis<T, K> axes[D];
-      for (int i = 0; i < D; ++i) factors<T, K>(offset[i], axes[i]);
-      const auto c = load_payload<T, D, HasS>(shape, payload, b, p);
-      spread<T>(axes, c, out + offset_of<D>(strides, first), strides.data());
+      one(b, p, offset, out + offset_of<D>(strides, first));
     });
+  });
+}
+
+// g = sum_p w (a + B r) + S grad w.
+template <class T, int D, int K, bool HasS>
+void scatter(const Shape<D>& shape, Index batch, Batched<const T> xi, const Payload<T>& payload,
+             Batched<T> g, Pool& pool) {
+  const auto strides = shape.strides();
+  scatter_each<T, D, K>(shape, batch, xi, g, pool, [&](Index b, Index p, const T* offset, T* node) {
+    Axis<T, K> axes[D];
+    for (int i = 0; i < D; ++i) factors<T, K>(offset[i], axes[i]);
+    spread<T>(axes, load_payload<T, D, HasS>(shape, payload, b, p), node, strides.data());
   });
 }
 
@@ -458,22 +468,12 @@ void scatter_tangent(const Shape<D>& shape, Index batch, Batched<const T> xi,
                      const Payload<T>& payload, Batched<const T> dxi, const Payload<T>& dpayload,
                      Batched<T> dg, Pool& pool) {
   const auto strides = shape.strides();
-  const Index size = shape.node_count() * kChannels;
-  for_each_member(batch, pool, [&](Index b, Pool& pool) {
-    T* out = dg.at(b);
-    clear(out, size * sizeof(T), pool);
-    const Columns<T, D, K> columns(shape, xi.at(b));
-    columns.for_each(pool, [&](Index p) {
-      Index first[D] = {};
-      T offset[D] = {};
-      locate<T, D, K>(shape, xi.at(b) + p * D, first, offset);
-      Axis<Dual<T>, K> axes[D];
-      for (int i = 0; i < D; ++i)
-        axes[i] = moving_factors<T, K>(offset[i], dxi.at(b)[p * D + i]);
-      const auto c = paired(load_payload<T, D, HasS>(shape, payload, b, p),
-                            load_payload<T, D, HasS>(shape, dpayload, b, p));
-      spread<T>(axes, c, out + offset_of<D>(strides, first), strides.data());
-    });
+  scatter_each<T, D, K>(shape, batch, xi, dg, pool, [&](Index b, Index p, const T* offset, T* node) {
+    Axis<Dual<T>, K> axes[D];
+    for (int i = 0; i < D; ++i) axes[i] = moving_factors<T, K>(offset[i], dxi.at(b)[p * D + i]);
+    const auto c = paired(load_payload<T, D, HasS>(shape, payload, b, p),
+                          load_payload<T, D, HasS>(shape, dpayload, b, p));
+    spread<T>(axes, c, node, strides.data());
   });
 }
 

@@ -101,6 +101,7 @@ def _define(
     plain = _over_batch(one)
 
     def on_cpu(*operands: Array, **static: Any) -> Arrays:
+        """The native kernel, or the reference where there is none or it does not fit."""
         dtype, d = operands[0].dtype, operands[0].shape[-1]
         library = native.library("transfer", jnp.dtype(dtype).name, d)
         wanted = results(*(a.shape for a in operands), **static)
@@ -116,6 +117,7 @@ def _define(
         return tuple(o[..., : shape[-1]] for o, shape in zip(out, wanted, strict=True))
 
     def shapes(*operands: ShapedArray, **static: Any) -> list[ShapedArray]:
+        """Types of the results."""
         shapes = results(*(a.shape for a in operands), **static)
         return [native.result_type(operands[0], shape) for shape in shapes]
 
