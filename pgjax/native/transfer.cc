@@ -1,8 +1,8 @@
 // What XLA calls: one library per precision (PGJAX_DOUBLE) and dimension (PGJAX_D).
 //
 // Every array has a leading batch direction of length 1 or that of the call. Shapes, `b` being it:
-// positions xi (b, p, D); payload a (b, p, c), B (b, p, m, D), S (b, p, m, D or 0); nodes
-// (b, n_1, ..., n_D, 4). Without S its last direction has length 0.
+// positions xi (b, p, D); payload a (b, p, 4), B (b, p, D, 4), S (b, p, D, 4); nodes
+// (b, n_1, ..., n_D, 4). Without S it has no elements.
 #include "transfer.h"
 
 #include "xla.h"
@@ -27,11 +27,10 @@ Payload<T> payload_of(In& a, In& B, In& S) {
 Moments<T> moments_of(Out& a, Out& B, Out& S) { return {each(a), each(B), each(S)}; }
 
 template <class NodeDimensions>
-Shape<D> shape_of(In& xi, NodeDimensions nodes, Index c, Index m) {
+Shape<D> shape_of(In& xi, NodeDimensions nodes) {
   Shape<D> shape;
   shape.particles = xi.dimensions()[1];
   for (int i = 0; i < D; ++i) shape.nodes[i] = nodes[i + 1];
-  shape.c = int(c), shape.m = int(m);
   return shape;
 }
 
@@ -53,8 +52,8 @@ ffi::Error with_kind(std::int64_t degree, bool has_S, const F& run) {
 
 ffi::Error Scatter(ffi::ThreadPool threads, std::int64_t degree, In xi, In a, In B, In S, Out g) {
   Pool pool = pool_of(threads);
-  const auto shape = shape_of(xi, g->dimensions(), a.dimensions()[2], B.dimensions()[2]);
-  return with_kind(degree, S.dimensions()[3] > 0, [&](auto K, auto HasS) {
+  const auto shape = shape_of(xi, g->dimensions());
+  return with_kind(degree, S.element_count() > 0, [&](auto K, auto HasS) {
     scatter<T, D, K, HasS>(shape, g->dimensions()[0], shared_or_each(xi), payload_of(a, B, S),
                            each(g), pool);
   });
@@ -63,8 +62,8 @@ ffi::Error Scatter(ffi::ThreadPool threads, std::int64_t degree, In xi, In a, In
 ffi::Error ScatterTangent(ffi::ThreadPool threads, std::int64_t degree, In xi, In a, In B, In S,
                           In dxi, In da, In dB, In dS, Out dg) {
   Pool pool = pool_of(threads);
-  const auto shape = shape_of(xi, dg->dimensions(), a.dimensions()[2], B.dimensions()[2]);
-  return with_kind(degree, S.dimensions()[3] > 0, [&](auto K, auto HasS) {
+  const auto shape = shape_of(xi, dg->dimensions());
+  return with_kind(degree, S.element_count() > 0, [&](auto K, auto HasS) {
     scatter_tangent<T, D, K, HasS>(shape, dg->dimensions()[0], shared_or_each(xi),
                                    payload_of(a, B, S), shared_or_each(dxi),
                                    payload_of(da, dB, dS), each(dg), pool);
@@ -73,8 +72,8 @@ ffi::Error ScatterTangent(ffi::ThreadPool threads, std::int64_t degree, In xi, I
 
 ffi::Error Gather(ffi::ThreadPool threads, std::int64_t degree, In xi, In g, Out a, Out B, Out S) {
   Pool pool = pool_of(threads);
-  const auto shape = shape_of(xi, g.dimensions(), a->dimensions()[2], B->dimensions()[2]);
-  return with_kind(degree, S->dimensions()[3] > 0, [&](auto K, auto HasS) {
+  const auto shape = shape_of(xi, g.dimensions());
+  return with_kind(degree, S->element_count() > 0, [&](auto K, auto HasS) {
     gather<T, D, K, HasS>(shape, a->dimensions()[0], shared_or_each(xi), shared_or_each(g),
                           moments_of(a, B, S), pool);
   });
@@ -83,8 +82,8 @@ ffi::Error Gather(ffi::ThreadPool threads, std::int64_t degree, In xi, In g, Out
 ffi::Error GatherTangent(ffi::ThreadPool threads, std::int64_t degree, In xi, In g, In dxi, In dg,
                          Out a, Out B, Out S) {
   Pool pool = pool_of(threads);
-  const auto shape = shape_of(xi, g.dimensions(), a->dimensions()[2], B->dimensions()[2]);
-  return with_kind(degree, S->dimensions()[3] > 0, [&](auto K, auto HasS) {
+  const auto shape = shape_of(xi, g.dimensions());
+  return with_kind(degree, S->element_count() > 0, [&](auto K, auto HasS) {
     gather_tangent<T, D, K, HasS>(shape, a->dimensions()[0], shared_or_each(xi),
                                   shared_or_each(g), shared_or_each(dxi), shared_or_each(dg),
                                   moments_of(a, B, S), pool);
@@ -94,8 +93,8 @@ ffi::Error GatherTangent(ffi::ThreadPool threads, std::int64_t degree, In xi, In
 ffi::Error Pull(ffi::ThreadPool threads, std::int64_t degree, In xi, In a, In B, In S, In g,
                 Out dxi, Out da, Out dB, Out dS) {
   Pool pool = pool_of(threads);
-  const auto shape = shape_of(xi, g.dimensions(), a.dimensions()[2], B.dimensions()[2]);
-  return with_kind(degree, S.dimensions()[3] > 0, [&](auto K, auto HasS) {
+  const auto shape = shape_of(xi, g.dimensions());
+  return with_kind(degree, S.element_count() > 0, [&](auto K, auto HasS) {
     pull<T, D, K, HasS>(shape, dxi->dimensions()[0], shared_or_each(xi), payload_of(a, B, S),
                         shared_or_each(g), each(dxi), moments_of(da, dB, dS), pool);
   });

@@ -37,40 +37,120 @@ struct VecOf {
 template <class T>
 using Vec = typename VecOf<T>::type;
 
+// Left to itself the compiler calls these, and passes what is in registers through memory.
+#define PGJAX_INLINED __attribute__((always_inline))
+#define PGJAX_INLINE inline PGJAX_INLINED
+
+// Anywhere in an array of T, which it may alias.
+template <class V, class T>
+PGJAX_INLINE V load_as(const T* p) {
+  typedef V Anywhere __attribute__((aligned(alignof(T))));
+  return *reinterpret_cast<const Anywhere*>(p);
+}
 template <class T>
-inline Vec<T> load(const T* p) {
-  Vec<T> v;
-  std::memcpy(&v, p, sizeof v);
-  return v;
+PGJAX_INLINE Vec<T> load(const T* p) {
+  return load_as<Vec<T>>(p);
 }
 
+template <class V, class T>
+PGJAX_INLINE void store(T* p, const V& v) {
+  typedef V Anywhere __attribute__((aligned(alignof(T))));
+  *reinterpret_cast<Anywhere*>(p) = v;
+}
+
+// The values of the K nodes of a stencil along the last direction, which lie side by side.
 template <class T>
-inline void add_to(T* p, Vec<T> v) {
-  v += load(p);
-  std::memcpy(p, &v, sizeof v);
+struct PairOf {
+  typedef T type __attribute__((vector_size(2 * kChannels * sizeof(T))));
+};
+template <class T, int K>
+struct Row {
+  using Pair = typename PairOf<T>::type;
+  using Rest = std::conditional_t<K == 4, Pair, Vec<T>>;
+  Pair pair;
+  Rest rest;
+
+  PGJAX_INLINE Row& operator+=(const Row& o) { return pair += o.pair, rest += o.rest, *this; }
+  PGJAX_INLINE friend Row operator+(Row a, const Row& b) { return a += b; }
+  PGJAX_INLINE friend Row operator*(const Row& a, const Row& b) { return {a.pair * b.pair, a.rest * b.rest}; }
+  PGJAX_INLINE friend Row operator*(T a, const Row& b) { return {a * b.pair, a * b.rest}; }
+};
+
+template <class P, class V>
+PGJAX_INLINE P joined(V low, V high) {
+  return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7);
+}
+template <class T, class P>
+PGJAX_INLINE Vec<T> halves_added(P p) {
+  const Vec<T> low = __builtin_shufflevector(p, p, 0, 1, 2, 3);
+  const Vec<T> high = __builtin_shufflevector(p, p, 4, 5, 6, 7);
+  return low + high;
+}
+
+// Each node's own number at all its channels.
+template <class T, int K>
+PGJAX_INLINE Row<T, K> each_its_own(const T w[K]) {
+  using Pair = typename Row<T, K>::Pair;
+  const Vec<T> zero = {}, w2 = zero + w[2];
+  const Pair pair = joined<Pair, Vec<T>>(zero + w[0], zero + w[1]);
+  if constexpr (K == 4)
+    return {pair, joined<Pair, Vec<T>>(w2, zero + w[3])};
+  else
+    return {pair, w2};
+}
+template <class T, int K>
+PGJAX_INLINE Vec<T> sum(const Row<T, K>& row) {
+  if constexpr (K == 4)
+    return halves_added<T>(row.pair + row.rest);
+  else
+    return halves_added<T>(row.pair) + row.rest;
+}
+
+template <class T, int K>
+PGJAX_INLINE Row<T, K> load_row(const T* p) {
+  using R = Row<T, K>;
+  return {load_as<typename R::Pair>(p), load_as<typename R::Rest>(p + 2 * kChannels)};
+}
+template <class T, int K>
+PGJAX_INLINE void add_to(T* p, Row<T, K> row) {
+  row += load_row<T, K>(p);
+  store(p, row.pair);
+  store(p + 2 * kChannels, row.rest);
 }
 
 // A value and its derivative along one direction.
 template <class N>
 struct Dual {
+  using Part = N;
   N v, d;
+
+  PGJAX_INLINE Dual& operator+=(const Dual& o) { return v += o.v, d += o.d, *this; }
 };
 template <class W, class N>
-inline N times(W w, N n) {
-  if constexpr (std::is_arithmetic_v<W>) {
-    return w * n;
-  } else {
-    return {w.v * n.v, w.v * n.d + w.d * n.v};
-  }
+PGJAX_INLINE N times(const W& w, const N& n) {
+  return w * n;
 }
-template <class N>
-inline void plus(N& a, N b) {
-  a += b;
+template <class W, class N>
+PGJAX_INLINE Dual<N> times(const Dual<W>& w, const Dual<N>& n) {
+  return {w.v * n.v, w.v * n.d + w.d * n.v};
 }
-template <class N>
-inline void plus(Dual<N>& a, Dual<N> b) {
-  a.v += b.v;
-  a.d += b.d;
+
+// The same value at every node of a row of type R; the sum over the nodes.
+template <class R, class V>
+PGJAX_INLINE R everywhere(const V& v) {
+  const auto pair = joined<typename R::Pair>(v, v);
+  if constexpr (std::is_same_v<typename R::Rest, V>)
+    return {pair, v};
+  else
+    return {pair, pair};
+}
+template <class R, class V>
+PGJAX_INLINE R everywhere(const Dual<V>& a) {
+  return {everywhere<typename R::Part>(a.v), everywhere<typename R::Part>(a.d)};
+}
+template <class T, int K>
+PGJAX_INLINE Dual<Vec<T>> sum(const Dual<Row<T, K>>& a) {
+  return {sum(a.v), sum(a.d)};
 }
 
 // Factors along one direction at the K nodes of a stencil; r = x_i - x_p.
@@ -81,20 +161,21 @@ struct Axis {
 
 // First node of the stencil, in cells.
 template <class T, int K>
-inline T first_node(T xi) {
+PGJAX_INLINE T first_node(T xi) {
   return std::floor(xi - T(K - 2) / 2);
 }
 
-// Weights of the B-spline of degree K - 1, and their first and second derivatives.
+// Weights of the B-spline of degree K - 1, and their first and second derivatives. Written so that
+// sum w = 1 and sum w' = 0 hold up to one rounding (as in pgjax/splines.py).
 template <class T, int K>
-inline void spline(T offset, T w[K], T dw[K], T ddw[K]) {
+PGJAX_INLINE void spline(T offset, T w[K], T dw[K], T ddw[K]) {
   if constexpr (K == 3) {
-    const T a = T(1.5) - offset, b = offset - 1, c = offset - T(0.5);
-    w[0] = a * a / 2, w[1] = T(0.75) - b * b, w[2] = c * c / 2;
-    dw[0] = -a, dw[1] = -2 * b, dw[2] = c;
+    const T t = offset - T(0.5), s = 1 - t;
+    w[0] = s * s / 2, w[2] = t * t / 2, w[1] = 1 - (w[0] + w[2]);
+    dw[0] = -s, dw[1] = s - t, dw[2] = t;
     ddw[0] = 1, ddw[1] = -2, ddw[2] = 1;
   } else {
-    // s^3/6 and t^3/6 cancel in the sums, as in pgjax/splines.py.
+    // s^3/6 and t^3/6 cancel in the sums.
     const T t = offset - 1, s = 1 - t;
     const T a = s * s * s / 6, b = t * t * t / 6, da = -s * s / 2, db = t * t / 2;
     w[0] = a, w[1] = s - (2 * a - b), w[2] = t - (2 * b - a), w[3] = b;
@@ -104,7 +185,7 @@ inline void spline(T offset, T w[K], T dw[K], T ddw[K]) {
 }
 
 template <class T, int K>
-inline void factors(T offset, Axis<T, K>& value) {
+PGJAX_INLINE void factors(T offset, Axis<T, K>& value) {
   T ddw[K];
   spline<T, K>(offset, value.w, value.dw, ddw);
   for (int i = 0; i < K; ++i) value.wr[i] = value.w[i] * (i - offset);
@@ -112,7 +193,7 @@ inline void factors(T offset, Axis<T, K>& value) {
 
 // The factors and their derivatives with respect to the position (in cells).
 template <class T, int K>
-inline void factors(T offset, Axis<T, K>& value, Axis<T, K>& slope) {
+PGJAX_INLINE void factors(T offset, Axis<T, K>& value, Axis<T, K>& slope) {
   spline<T, K>(offset, value.w, value.dw, slope.dw);
   for (int i = 0; i < K; ++i) {
     const T r = i - offset;
@@ -120,6 +201,26 @@ inline void factors(T offset, Axis<T, K>& value, Axis<T, K>& slope) {
     slope.w[i] = value.dw[i];
     slope.wr[i] = value.dw[i] * r - value.w[i];
   }
+}
+
+// The factors of the last direction, as rows.
+template <class R>
+struct LastAxis {
+  R w, wr, dw;
+};
+template <class T, int K>
+PGJAX_INLINE LastAxis<Row<T, K>> last_axis(const Axis<T, K>& axis) {
+  return {each_its_own<T, K>(axis.w), each_its_own<T, K>(axis.wr), each_its_own<T, K>(axis.dw)};
+}
+template <class T, int K>
+PGJAX_INLINE Dual<Row<T, K>> each_its_own(const Dual<T> a[K]) {
+  T v[K], d[K];
+  for (int i = 0; i < K; ++i) v[i] = a[i].v, d[i] = a[i].d;
+  return {each_its_own<T, K>(v), each_its_own<T, K>(d)};
+}
+template <class T, int K>
+PGJAX_INLINE LastAxis<Dual<Row<T, K>>> last_axis(const Axis<Dual<T>, K>& axis) {
+  return {each_its_own<T, K>(axis.w), each_its_own<T, K>(axis.wr), each_its_own<T, K>(axis.dw)};
 }
 
 // What is left of a payload after some directions: M of them are still to come.
@@ -131,12 +232,12 @@ struct Coefficients {
 };
 
 template <class W, int K, class N, int M, bool HasS>
-inline Coefficients<N, M - 1, HasS> descend(const Axis<W, K>& axis, int i,
+PGJAX_INLINE Coefficients<N, M - 1, HasS> descend(const Axis<W, K>& axis, int i,
                                             const Coefficients<N, M, HasS>& c) {
   Coefficients<N, M - 1, HasS> n;
   n.A = times(axis.w[i], c.A);
-  plus(n.A, times(axis.wr[i], c.B[0]));
-  if constexpr (HasS) plus(n.A, times(axis.dw[i], c.S[0]));
+  n.A += times(axis.wr[i], c.B[0]);
+  if constexpr (HasS) n.A += times(axis.dw[i], c.S[0]);
   for (int m = 1; m < M; ++m) {
     n.B[m - 1] = times(axis.w[i], c.B[m]);
     if constexpr (HasS) n.S[m - 1] = times(axis.w[i], c.S[m]);
@@ -146,27 +247,57 @@ inline Coefficients<N, M - 1, HasS> descend(const Axis<W, K>& axis, int i,
 
 // The transpose of `descend`.
 template <class W, int K, class N, int M, bool HasS>
-inline void ascend(const Axis<W, K>& axis, int i, const Coefficients<N, M - 1, HasS>& n,
+PGJAX_INLINE void ascend(const Axis<W, K>& axis, int i, const Coefficients<N, M - 1, HasS>& n,
                    Coefficients<N, M, HasS>& c) {
-  plus(c.A, times(axis.w[i], n.A));
-  plus(c.B[0], times(axis.wr[i], n.A));
-  if constexpr (HasS) plus(c.S[0], times(axis.dw[i], n.A));
+  c.A += times(axis.w[i], n.A);
+  c.B[0] += times(axis.wr[i], n.A);
+  if constexpr (HasS) c.S[0] += times(axis.dw[i], n.A);
   for (int m = 1; m < M; ++m) {
-    plus(c.B[m], times(axis.w[i], n.B[m - 1]));
-    if constexpr (HasS) plus(c.S[m], times(axis.w[i], n.S[m - 1]));
+    c.B[m] += times(axis.w[i], n.B[m - 1]);
+    if constexpr (HasS) c.S[m] += times(axis.w[i], n.S[m - 1]);
   }
 }
 
-// Scatter of one particle: `node` is the first node that is left of its stencil.
+// `descend` along the last direction, all its nodes at once, before any other direction.
+template <class R, class V, int M, bool HasS>
+PGJAX_INLINE Coefficients<R, M - 1, HasS> widen(const LastAxis<R>& axis,
+                                          const Coefficients<V, M, HasS>& c) {
+  Coefficients<R, M - 1, HasS> n;
+  n.A = times(axis.w, everywhere<R>(c.A));
+  n.A += times(axis.wr, everywhere<R>(c.B[M - 1]));
+  if constexpr (HasS) n.A += times(axis.dw, everywhere<R>(c.S[M - 1]));
+  for (int m = 0; m < M - 1; ++m) {
+    n.B[m] = times(axis.w, everywhere<R>(c.B[m]));
+    if constexpr (HasS) n.S[m] = times(axis.w, everywhere<R>(c.S[m]));
+  }
+  return n;
+}
+
+// The transpose of `widen`.
+template <class V, class R, int N, bool HasS>
+PGJAX_INLINE Coefficients<V, N + 1, HasS> narrow(const LastAxis<R>& axis,
+                                           const Coefficients<R, N, HasS>& n) {
+  Coefficients<V, N + 1, HasS> c;
+  c.A = sum(times(axis.w, n.A));
+  c.B[N] = sum(times(axis.wr, n.A));
+  if constexpr (HasS) c.S[N] = sum(times(axis.dw, n.A));
+  for (int m = 0; m < N; ++m) {
+    c.B[m] = sum(times(axis.w, n.B[m]));
+    if constexpr (HasS) c.S[m] = sum(times(axis.w, n.S[m]));
+  }
+  return c;
+}
+
+// Scatter of one particle, widened: `node` is the first node that is left of its stencil.
 template <class T, class W, int K, class N, int M, bool HasS>
-inline void spread(const Axis<W, K>* axes, const Coefficients<N, M, HasS>& c, T* node,
+PGJAX_INLINE void spread(const Axis<W, K>* axes, const Coefficients<N, M, HasS>& c, T* node,
                    const Index* stride) {
 #pragma GCC unroll 4
   for (int i = 0; i < K; ++i, node += *stride) {
     const auto n = descend(*axes, i, c);
     if constexpr (M > 1) {
       spread(axes + 1, n, node, stride + 1);
-    } else if constexpr (std::is_same_v<N, Vec<T>>) {
+    } else if constexpr (std::is_same_v<N, Row<T, K>>) {
       add_to(node, n.A);
     } else {
       add_to(node, n.A.d);
@@ -174,18 +305,18 @@ inline void spread(const Axis<W, K>* axes, const Coefficients<N, M, HasS>& c, T*
   }
 }
 
-template <class T>
-inline void read(const T* g, Index at, Vec<T>& out) {
-  out = load(g + at);
+template <class T, int K>
+PGJAX_INLINE void read(const T* g, Index at, Row<T, K>& out) {
+  out = load_row<T, K>(g + at);
 }
-template <class T>
-inline void read(Dual<const T*> g, Index at, Dual<Vec<T>>& out) {
-  out = {load(g.v + at), load(g.d + at)};
+template <class T, int K>
+PGJAX_INLINE void read(Dual<const T*> g, Index at, Dual<Row<T, K>>& out) {
+  out = {load_row<T, K>(g.v + at), load_row<T, K>(g.d + at)};
 }
 
-// Gather of one particle.
+// Gather of one particle, not yet narrowed.
 template <class T, class W, int K, class N, int M, bool HasS, class G>
-inline Coefficients<N, M, HasS> collect(const Axis<W, K>* axes, G g, Index at,
+PGJAX_INLINE Coefficients<N, M, HasS> collect(const Axis<W, K>* axes, G g, Index at,
                                         const Index* stride) {
   Coefficients<N, M, HasS> c{};
 #pragma GCC unroll 4
@@ -201,28 +332,35 @@ inline Coefficients<N, M, HasS> collect(const Axis<W, K>* axes, G g, Index at,
   return c;
 }
 
+// The product of two sets of coefficients.
+template <class N, int M, bool HasS>
+PGJAX_INLINE N product(const Coefficients<N, M, HasS>& a, const Coefficients<N, M, HasS>& b) {
+  N sum = a.A * b.A;
+  for (int m = 0; m < M; ++m) {
+    sum += a.B[m] * b.B[m];
+    if constexpr (HasS) sum += a.S[m] * b.S[m];
+  }
+  return sum;
+}
+
 // The derivative of Phi with respect to position (into `pull`, to be summed over its lanes) and
-// payload (returned), at payload c and node values g.
+// payload (returned), at payload c and node values g; both widened.
 template <class T, int K, int M, bool HasS>
-inline Coefficients<Vec<T>, M, HasS> differentiate(const Axis<T, K>* axes, const Axis<T, K>* slopes,
-                                                   const Coefficients<Vec<T>, M, HasS>& c,
-                                                   const T* g, Index at, const Index* stride,
-                                                   Vec<T>* pull) {
-  Coefficients<Vec<T>, M, HasS> bar{};
+PGJAX_INLINE Coefficients<Row<T, K>, M, HasS> differentiate(const Axis<T, K>* axes,
+                                                      const Axis<T, K>* slopes,
+                                                      const Coefficients<Row<T, K>, M, HasS>& c,
+                                                      const T* g, Index at, const Index* stride,
+                                                      Row<T, K>* pull) {
+  Coefficients<Row<T, K>, M, HasS> bar{};
 #pragma GCC unroll 4
   for (int i = 0; i < K; ++i, at += *stride) {
-    Coefficients<Vec<T>, M - 1, HasS> n;
+    Coefficients<Row<T, K>, M - 1, HasS> n;
     if constexpr (M > 1) {
       n = differentiate(axes + 1, slopes + 1, descend(*axes, i, c), g, at, stride + 1, pull + 1);
     } else {
-      n.A = load(g + at);
+      n.A = load_row<T, K>(g + at);
     }
-    const auto moved = descend(*slopes, i, c);
-    *pull += moved.A * n.A;
-    for (int m = 0; m < M - 1; ++m) {
-      *pull += moved.B[m] * n.B[m];
-      if constexpr (HasS) *pull += moved.S[m] * n.S[m];
-    }
+    *pull += product(descend(*slopes, i, c), n);
     ascend(*axes, i, n, bar);
   }
   return bar;
@@ -236,11 +374,10 @@ struct Batched {
   T* at(Index b) const { return data + b * step; }
 };
 
-// What does not depend on the particle. `c` channels of a payload, `m` of which have a gradient.
+// What does not depend on the particle.
 template <int D>
 struct Shape {
   Index particles, nodes[D];
-  int c, m;
 
   Index node_count() const {
     Index n = 1;
@@ -257,7 +394,7 @@ struct Shape {
 
 // Where the stencil of a particle lies in the array; false where it does not fit.
 template <class T, int D, int K>
-inline bool locate(const Shape<D>& shape, const T* xi, Index first[D], T offset[D]) {
+PGJAX_INLINE bool locate(const Shape<D>& shape, const T* xi, Index first[D], T offset[D]) {
   for (int i = 0; i < D; ++i) {
     const T base = first_node<T, K>(xi[i]);
     // Written so that NaN is refused.
@@ -269,23 +406,15 @@ inline bool locate(const Shape<D>& shape, const T* xi, Index first[D], T offset[
 }
 
 template <int D>
-inline Index offset_of(const std::array<Index, D>& strides, const Index first[D]) {
+PGJAX_INLINE Index offset_of(const std::array<Index, D>& strides, const Index first[D]) {
   Index at = 0;
   for (int i = 0; i < D; ++i) at += first[i] * strides[i];
   return at;
 }
 
-template <class T>
-inline Vec<T> load_some(const T* p, int n, int step) {
-  Vec<T> v{};
-  for (int i = 0; i < kChannels; ++i)
-    if (i < n) v[i] = p[i * step];
-  return v;
-}
-template <class T>
-inline void store_some(T* p, int n, int step, Vec<T> v) {
-  for (int i = 0; i < kChannels; ++i)
-    if (i < n) p[i * step] = v[i];
+template <class V>
+PGJAX_INLINE auto total(V v) {
+  return v[0] + v[1] + v[2] + v[3];
 }
 
 template <class T>
@@ -298,31 +427,30 @@ struct Moments {
 };
 
 template <class T, int D, bool HasS>
-inline Coefficients<Vec<T>, D, HasS> load_payload(const Shape<D>& shape, const Payload<T>& from,
-                                                  Index b, Index p) {
+PGJAX_INLINE Coefficients<Vec<T>, D, HasS> load_payload(const Payload<T>& from, Index b, Index p) {
   Coefficients<Vec<T>, D, HasS> c;
-  c.A = load_some(from.a.at(b) + p * shape.c, shape.c, 1);
-  const Index row = p * shape.m * D;
+  c.A = load(from.a.at(b) + p * kChannels);
   for (int j = 0; j < D; ++j) {
-    c.B[j] = load_some(from.B.at(b) + row + j, shape.m, D);
-    if constexpr (HasS) c.S[j] = load_some(from.S.at(b) + row + j, shape.m, D);
+    const Index at = (p * D + j) * kChannels;
+    c.B[j] = load(from.B.at(b) + at);
+    if constexpr (HasS) c.S[j] = load(from.S.at(b) + at);
   }
   return c;
 }
 
 template <class T, int D, bool HasS>
-inline void store_moments(const Shape<D>& shape, const Moments<T>& to, Index b, Index p,
-                          const Coefficients<Vec<T>, D, HasS>& c) {
-  store_some(to.a.at(b) + p * shape.c, shape.c, 1, c.A);
-  const Index row = p * shape.m * D;
+PGJAX_INLINE void store_moments(const Moments<T>& to, Index b, Index p,
+                                const Coefficients<Vec<T>, D, HasS>& c) {
+  store(to.a.at(b) + p * kChannels, c.A);
   for (int j = 0; j < D; ++j) {
-    store_some(to.B.at(b) + row + j, shape.m, D, c.B[j]);
-    if constexpr (HasS) store_some(to.S.at(b) + row + j, shape.m, D, c.S[j]);
+    const Index at = (p * D + j) * kChannels;
+    store(to.B.at(b) + at, c.B[j]);
+    if constexpr (HasS) store(to.S.at(b) + at, c.S[j]);
   }
 }
 
 template <class V, int D, bool HasS>
-inline Coefficients<Dual<V>, D, HasS> paired(const Coefficients<V, D, HasS>& v,
+PGJAX_INLINE Coefficients<Dual<V>, D, HasS> paired(const Coefficients<V, D, HasS>& v,
                                              const Coefficients<V, D, HasS>& d) {
   Coefficients<Dual<V>, D, HasS> c;
   c.A = {v.A, d.A};
@@ -334,7 +462,7 @@ inline Coefficients<Dual<V>, D, HasS> paired(const Coefficients<V, D, HasS>& v,
 }
 
 template <class V, int D, bool HasS>
-inline Coefficients<V, D, HasS> tangent_of(const Coefficients<Dual<V>, D, HasS>& c) {
+PGJAX_INLINE Coefficients<V, D, HasS> tangent_of(const Coefficients<Dual<V>, D, HasS>& c) {
   Coefficients<V, D, HasS> d;
   d.A = c.A.d;
   for (int j = 0; j < D; ++j) {
@@ -345,7 +473,7 @@ inline Coefficients<V, D, HasS> tangent_of(const Coefficients<Dual<V>, D, HasS>&
 }
 
 template <class T, int K>
-inline Axis<Dual<T>, K> moving_factors(T offset, T speed) {
+PGJAX_INLINE Axis<Dual<T>, K> moving_factors(T offset, T speed) {
   Axis<T, K> value, slope;
   factors<T, K>(offset, value, slope);
   Axis<Dual<T>, K> out;
@@ -458,7 +586,8 @@ void scatter(const Shape<D>& shape, Index batch, Batched<const T> xi, const Payl
   scatter_each<T, D, K>(shape, batch, xi, g, pool, [&](Index b, Index p, const T* offset, T* node) {
     Axis<T, K> axes[D];
     for (int i = 0; i < D; ++i) factors<T, K>(offset[i], axes[i]);
-    spread<T>(axes, load_payload<T, D, HasS>(shape, payload, b, p), node, strides.data());
+    const auto c = load_payload<T, D, HasS>(payload, b, p);
+    spread<T>(axes, widen(last_axis(axes[D - 1]), c), node, strides.data());
   });
 }
 
@@ -471,9 +600,27 @@ void scatter_tangent(const Shape<D>& shape, Index batch, Batched<const T> xi,
   scatter_each<T, D, K>(shape, batch, xi, dg, pool, [&](Index b, Index p, const T* offset, T* node) {
     Axis<Dual<T>, K> axes[D];
     for (int i = 0; i < D; ++i) axes[i] = moving_factors<T, K>(offset[i], dxi.at(b)[p * D + i]);
-    const auto c = paired(load_payload<T, D, HasS>(shape, payload, b, p),
-                          load_payload<T, D, HasS>(shape, dpayload, b, p));
-    spread<T>(axes, c, node, strides.data());
+    const auto c = paired(load_payload<T, D, HasS>(payload, b, p),
+                          load_payload<T, D, HasS>(dpayload, b, p));
+    spread<T>(axes, widen(last_axis(axes[D - 1]), c), node, strides.data());
+  });
+}
+
+// Calls `one(b, p, offset, at)` for every particle that fits: its place in the cell and where the
+// first node of its stencil is. The results of the others are zero.
+template <class T, int D, int K, bool HasS, class F>
+void gather_each(const Shape<D>& shape, Index batch, Batched<const T> xi, const Moments<T>& out,
+                 Pool& pool, const F& one) {
+  const auto strides = shape.strides();
+  for_each_member(batch, pool, [&](Index b, Pool& pool) {
+    for_each_particle(shape.particles, pool, [&](Index p) {
+      Index first[D] = {};
+      T offset[D] = {};
+      if (locate<T, D, K>(shape, xi.at(b) + p * D, first, offset))
+        one(b, p, offset, offset_of<D>(strides, first));
+      else
+        store_moments<T, D, HasS>(out, b, p, Coefficients<Vec<T>, D, HasS>());
+    });
   });
 }
 
@@ -482,20 +629,16 @@ template <class T, int D, int K, bool HasS>
 void gather(const Shape<D>& shape, Index batch, Batched<const T> xi, Batched<const T> g,
             const Moments<T>& out, Pool& pool) {
   const auto strides = shape.strides();
-  for_each_member(batch, pool, [&](Index b, Pool& pool) {
-    for_each_particle(shape.particles, pool, [&](Index p) {
-      Index first[D] = {};
-      T offset[D] = {};
-      Coefficients<Vec<T>, D, HasS> c{};
-      if (locate<T, D, K>(shape, xi.at(b) + p * D, first, offset)) {
-        Axis<T, K> axes[D];
-        for (int i = 0; i < D; ++i) factors<T, K>(offset[i], axes[i]);
-        c = collect<T, T, K, Vec<T>, D, HasS>(axes, g.at(b), offset_of<D>(strides, first),
-                                              strides.data());
-      }
-      store_moments<T, D, HasS>(shape, out, b, p, c);
-    });
-  });
+  const auto one = [&](Index b, Index p, const T* offset, Index at) {
+    Axis<T, K> axes[D];
+    for (int i = 0; i < D; ++i) factors<T, K>(offset[i], axes[i]);
+    const auto wide =
+        collect<T, T, K, Row<T, K>, D - 1, HasS>(axes, g.at(b), at, strides.data());
+    // Never assigned to what exists: a copy through memory stalls.
+    const auto c = narrow<Vec<T>>(last_axis(axes[D - 1]), wide);
+    store_moments<T, D, HasS>(out, b, p, c);
+  };
+  gather_each<T, D, K, HasS>(shape, batch, xi, out, pool, one);
 }
 
 // The derivative of `gather` along (dxi, dg).
@@ -503,47 +646,41 @@ template <class T, int D, int K, bool HasS>
 void gather_tangent(const Shape<D>& shape, Index batch, Batched<const T> xi, Batched<const T> g,
                     Batched<const T> dxi, Batched<const T> dg, const Moments<T>& out, Pool& pool) {
   const auto strides = shape.strides();
-  for_each_member(batch, pool, [&](Index b, Pool& pool) {
-    for_each_particle(shape.particles, pool, [&](Index p) {
-      Index first[D] = {};
-      T offset[D] = {};
-      Coefficients<Vec<T>, D, HasS> c{};
-      if (locate<T, D, K>(shape, xi.at(b) + p * D, first, offset)) {
-        Axis<Dual<T>, K> axes[D];
-        for (int i = 0; i < D; ++i)
-          axes[i] = moving_factors<T, K>(offset[i], dxi.at(b)[p * D + i]);
-        const Dual<const T*> both{g.at(b), dg.at(b)};
-        c = tangent_of(collect<T, Dual<T>, K, Dual<Vec<T>>, D, HasS>(
-            axes, both, offset_of<D>(strides, first), strides.data()));
-      }
-      store_moments<T, D, HasS>(shape, out, b, p, c);
-    });
-  });
+  const auto one = [&](Index b, Index p, const T* offset, Index at) {
+    Axis<Dual<T>, K> axes[D];
+    for (int i = 0; i < D; ++i) axes[i] = moving_factors<T, K>(offset[i], dxi.at(b)[p * D + i]);
+    const Dual<const T*> both{g.at(b), dg.at(b)};
+    const auto wide = collect<T, Dual<T>, K, Dual<Row<T, K>>, D - 1, HasS>(axes, both, at,
+                                                                          strides.data());
+    const auto c = tangent_of(narrow<Dual<Vec<T>>>(last_axis(axes[D - 1]), wide));
+    store_moments<T, D, HasS>(out, b, p, c);
+  };
+  gather_each<T, D, K, HasS>(shape, batch, xi, out, pool, one);
 }
 
-// The derivative of Phi with respect to the positions and the payload.
+// The derivative of Phi with respect to the positions and the payload. Positions of particles
+// outside get zero.
 template <class T, int D, int K, bool HasS>
 void pull(const Shape<D>& shape, Index batch, Batched<const T> xi, const Payload<T>& payload,
           Batched<const T> g, Batched<T> dxi, const Moments<T>& out, Pool& pool) {
   const auto strides = shape.strides();
-  for_each_member(batch, pool, [&](Index b, Pool& pool) {
-    for_each_particle(shape.particles, pool, [&](Index p) {
-      Index first[D] = {};
-      T offset[D] = {};
-      Coefficients<Vec<T>, D, HasS> bar{};
-      Vec<T> along[D] = {};
-      if (locate<T, D, K>(shape, xi.at(b) + p * D, first, offset)) {
-        Axis<T, K> axes[D], slopes[D];
-        for (int i = 0; i < D; ++i) factors<T, K>(offset[i], axes[i], slopes[i]);
-        const auto c = load_payload<T, D, HasS>(shape, payload, b, p);
-        bar = differentiate<T, K>(axes, slopes, c, g.at(b), offset_of<D>(strides, first),
-                                  strides.data(), along);
-      }
-      for (int i = 0; i < D; ++i)
-        dxi.at(b)[p * D + i] = along[i][0] + along[i][1] + along[i][2] + along[i][3];
-      store_moments<T, D, HasS>(shape, out, b, p, bar);
-    });
-  });
+  const Index members = dxi.step ? batch : 1;
+  clear(dxi.data, members * shape.particles * D * sizeof(T), pool);
+  const auto one = [&](Index b, Index p, const T* offset, Index at) {
+    Axis<T, K> axes[D], slopes[D];
+    for (int i = 0; i < D; ++i) factors<T, K>(offset[i], axes[i], slopes[i]);
+    const auto c = load_payload<T, D, HasS>(payload, b, p);
+    const auto last = last_axis(axes[D - 1]);
+    Row<T, K> along[D - 1] = {};
+    const auto wide = differentiate<T, K>(axes, slopes, widen(last, c), g.at(b), at,
+                                          strides.data(), along);
+    T* to = dxi.at(b) + p * D;
+    for (int i = 0; i < D - 1; ++i) to[i] = total(sum(along[i]));
+    to[D - 1] = total(sum(product(widen(last_axis(slopes[D - 1]), c), wide)));
+    const auto bar = narrow<Vec<T>>(last, wide);
+    store_moments<T, D, HasS>(out, b, p, bar);
+  };
+  gather_each<T, D, K, HasS>(shape, batch, xi, out, pool, one);
 }
 
 }  // namespace pgjax

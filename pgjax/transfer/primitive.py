@@ -27,7 +27,6 @@ from pgjax.transfer import reference
 
 # Values of a node in the native kernels (`kChannels` in native/transfer.h).
 _CHANNELS = 4
-_TO_NODES = ("scatter", "scatter_tangent")
 
 Arrays = tuple[Array, ...]
 Shape = tuple[int, ...]
@@ -90,31 +89,37 @@ def _pull_shapes(*operands: Shape, **_: Any) -> list[Shape]:
 
 
 def _define(
-    name: str,
-    one: Callable[..., Arrays],
-    results: Callable[..., list[Shape]],
-    nodes_in: tuple[int, ...] = (),
+    name: str, one: Callable[..., Arrays], results: Callable[..., list[Shape]], kinds: str
 ) -> Primitive:
-    """A primitive with its shapes, batching and lowering; `nodes_in`: operands that are grids."""
+    """A primitive with its shapes, batching and lowering.
+
+    `kinds`: of the operands, then of the results; x: positions, a: values per particle or node,
+    B: gradients per particle.
+    """
     primitive = Primitive(f"pgjax_{name}")
     primitive.multiple_results = True
     plain = _over_batch(one)
+    kinds_in, kinds_out = kinds.split(" ")
 
     def on_cpu(*operands: Array, **static: Any) -> Arrays:
         """The native kernel, or the reference where there is none or it does not fit."""
         dtype, d = operands[0].dtype, operands[0].shape[-1]
         library = native.library("transfer", jnp.dtype(dtype).name, d)
         wanted = results(*(a.shape for a in operands), **static)
+        channels = [a.shape[-1] for a, kind in zip(operands, kinds_in, strict=True) if kind == "a"]
         # The kernels count particles in 32 bits.
-        unfit = max(shape[-1] for shape in wanted) > _CHANNELS or operands[0].shape[1] >= 2**31
+        unfit = max(channels) > _CHANNELS or operands[0].shape[1] >= 2**31
         if library is None or unfit:
             return plain(*operands, **static)
-        operands = tuple(_full(a) if i in nodes_in else a for i, a in enumerate(operands))
-        full = [(*shape[:-1], _CHANNELS) if name in _TO_NODES else shape for shape in wanted]
-        returned = [jax.ShapeDtypeStruct(shape, dtype) for shape in full]
-        call = jax.ffi.ffi_call(library.targets[name], returned)
-        out = call(*operands, degree=np.int64(static["degree"]))
-        return tuple(o[..., : shape[-1]] for o, shape in zip(out, wanted, strict=True))
+        packed = map(_pack, operands, kinds_in)
+        returned = [
+            jax.ShapeDtypeStruct(_packed_shape(shape, kind), dtype)
+            for shape, kind in zip(wanted, kinds_out, strict=True)
+        ]
+        out = jax.ffi.ffi_call(library.targets[name], returned)(
+            *packed, degree=np.int64(static["degree"])
+        )
+        return tuple(map(_unpack, out, wanted, kinds_out))
 
     def shapes(*operands: ShapedArray, **static: Any) -> list[ShapedArray]:
         """Types of the results."""
@@ -129,10 +134,29 @@ def _define(
     return primitive
 
 
-def _full(g: Array) -> Array:
-    """Node values with the unused channels filled up."""
-    missing = _CHANNELS - g.shape[-1]
-    return jnp.pad(g, [(0, 0)] * (g.ndim - 1) + [(0, missing)]) if missing else g
+# In the kernels the channels are last and filled up to four: one vector register.
+
+
+def _packed_shape(shape: Shape, kind: str) -> Shape:
+    if kind == "x":
+        return shape
+    if kind == "a":
+        return (*shape[:-1], _CHANNELS)
+    # An absent flux keeps a direction of length 0.
+    return (*shape[:-2], shape[-1], _CHANNELS if shape[-1] else 0)
+
+
+def _pack(a: Array, kind: str) -> Array:
+    shape = _packed_shape(a.shape, kind)
+    a = jnp.swapaxes(a, -1, -2) if kind == "B" else a
+    missing = shape[-1] - a.shape[-1]
+    return jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)]) if missing > 0 else a
+
+
+def _unpack(a: Array, shape: Shape, kind: str) -> Array:
+    if kind == "B":
+        return jnp.swapaxes(a[..., : shape[-2]], -1, -2) if shape[-1] else a.reshape(shape)
+    return a[..., : shape[-1]]
 
 
 def _batch(primitive: Primitive, operands: Arrays, axes: Any, **static: Any) -> Any:
@@ -174,11 +198,11 @@ def _bind(primitive: Primitive, *operands: Array, **static: Any) -> list[Array]:
     return primitive.bind(*operands, **static)
 
 
-scatter_p = _define("scatter", _scatter, _nodes_shape)
-scatter_tangent_p = _define("scatter_tangent", _scatter_tangent, _nodes_shape)
-gather_p = _define("gather", _gather, _moment_shapes, nodes_in=(1,))
-gather_tangent_p = _define("gather_tangent", _gather_tangent, _moment_shapes, nodes_in=(1, 3))
-pull_p = _define("pull", _pull, _pull_shapes, nodes_in=(4,))
+scatter_p = _define("scatter", _scatter, _nodes_shape, "xaBB a")
+scatter_tangent_p = _define("scatter_tangent", _scatter_tangent, _nodes_shape, "xaBBxaBB a")
+gather_p = _define("gather", _gather, _moment_shapes, "xa aBB")
+gather_tangent_p = _define("gather_tangent", _gather_tangent, _moment_shapes, "xaxa aBB")
+pull_p = _define("pull", _pull, _pull_shapes, "xaBBa xaBB")
 
 
 def _instantiated(tangents: Any) -> list[Array]:

@@ -74,7 +74,7 @@ Batched<T> out(Numbers<T>& a, Index batch) {
 template <class T, int D, int K, bool HasS>
 Numbers<T> run(Index particles, Index batch, const Numbers<T>& xi, Pool& pool) {
   Shape<D> shape;
-  shape.particles = particles, shape.c = D + 1, shape.m = D;
+  shape.particles = particles;
   for (int i = 0; i < D; ++i) shape.nodes[i] = 29 + i;
   std::mt19937 random(7);
   std::normal_distribution<T> normal;
@@ -83,9 +83,10 @@ Numbers<T> run(Index particles, Index batch, const Numbers<T>& xi, Pool& pool) {
     for (T& v : a) v = normal(random);
     return a;
   };
-  const Index n = batch * particles, s = HasS ? D : 0, nodes = shape.node_count() * kChannels;
-  const auto a = drawn(n * (D + 1)), B = drawn(n * D * D), S = drawn(n * D * s);
-  const auto da = drawn(n * (D + 1)), dB = drawn(n * D * D), dS = drawn(n * D * s);
+  const Index n = batch * particles, nodes = shape.node_count() * kChannels;
+  const Index values = n * kChannels, slopes = values * D, fluxes = HasS ? slopes : 0;
+  const auto a = drawn(values), B = drawn(slopes), S = drawn(fluxes);
+  const auto da = drawn(values), dB = drawn(slopes), dS = drawn(fluxes);
   const auto dxi = drawn(n * D), g = drawn(batch * nodes), dg = drawn(batch * nodes);
   const Payload<T> payload{in(a, batch), in(B, batch), in(S, batch)};
   const Payload<T> moved{in(da, batch), in(dB, batch), in(dS, batch)};
