@@ -1,5 +1,8 @@
 """Operations whose derivative is finite where the textbook formula divides by zero."""
 
+import functools
+import operator
+
 import jax.numpy as jnp
 
 from pgjax._types import Array, Float
@@ -11,9 +14,18 @@ def safe_divide(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, 
     return jnp.where(nonzero, a / jnp.where(nonzero, b, 1), 0)
 
 
+def dot(a: Float[Array, "*batch n"], b: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Dot product over a short last axis, written out: `vmap` makes vector code of it.
+
+    XLA turns a reduction over three components into a loop for each result.
+    """
+    products = a * b
+    return functools.reduce(operator.add, (products[..., i] for i in range(products.shape[-1])))
+
+
 def safe_norm(a: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     """Euclidean norm over the last axis, with derivative 0 at 0."""
-    square = jnp.sum(a * a, axis=-1)
+    square = dot(a, a) if a.shape[-1] <= 3 else jnp.sum(a * a, axis=-1)
     nonzero = square > 0
     return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1)), 0)
 

@@ -92,13 +92,16 @@ class Grid(eqx.Module):
             for n, m, periodic in zip(self.shape, self.padded_shape, self.periodic, strict=True)
         )
 
-    def nodes(self) -> Float[Array, "*grid d"]:
-        """Positions of the distinct nodes relative to the origin, m."""
-        axes = [
-            jnp.arange(m, dtype=self.h.dtype) - (0 if periodic else PAD)
+    def axes(self) -> list[Float[Array, " n"]]:
+        """Positions of the distinct nodes along each direction relative to the origin, m."""
+        return [
+            (jnp.arange(m, dtype=self.h.dtype) - (0 if periodic else PAD)) * self.h
             for m, periodic in zip(self.node_shape, self.periodic, strict=True)
         ]
-        return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1) * self.h
+
+    def nodes(self) -> Float[Array, "*grid d"]:
+        """Positions of the distinct nodes relative to the origin, m."""
+        return jnp.stack(jnp.meshgrid(*self.axes(), indexing="ij"), axis=-1)
 
     def cells(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
         """A position relative to the origin in units of h, wrapped along periodic directions."""

@@ -6,16 +6,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Scalar
-from pgjax.boundary import Particles
+from pgjax.boundary import AbstractGridCondition, Particles, Region, sweep
+from pgjax.grid import Grid
 from pgjax.models.elasticity import volume_change
 from pgjax.models.material import cast, particle_axes
 from pgjax.result import Condition
 from pgjax.scene import Scene
 from pgjax.state import State
 from pgjax.transfer import Payload, Stencil, gather, scatter, stencil
+
+Vectors = Float[Array, "d n"]
 
 
 def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
@@ -38,8 +42,8 @@ def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
 
     held, state = _impose(scene, state, t, dt)
     state, at, tau = _stress(scene, state, t)
-    grid_mass, grid_v = _particles_to_grid(scene, state, at, tau, dt)
-    grid_v = _forces_and_boundaries(scene, grid_mass, grid_v, t, dt)
+    momentum_and_mass = _particles_to_grid(scene, state, at, tau, dt)
+    grid_v = _forces_and_boundaries(scene, at, momentum_and_mass, t, dt)
     v, C, L = _grid_to_particles(scene, at, grid_v)
     return _update(scene, state, held, v, C, L, dt)
 
@@ -125,8 +129,8 @@ def _particles_to_grid(
     at: Stencil,
     tau: Float[Array, "p 3 3"],
     dt: Scalar,
-) -> tuple[Float[Array, "*grid 1"], Float[Array, "*grid d"]]:
-    """Mass and velocity of the nodes, the internal forces already in the momentum.
+) -> Float[Array, "*grid c"]:
+    """Momentum and mass of the nodes, the internal forces already in the momentum.
 
     `m_i = Σ w m_p`, `m_i v_i = Σ w m_p (v_p + C_p (x_i − x_p)) − Δt Σ V⁰ τ ∇w` (eqs. 1–2).
     """
@@ -138,26 +142,39 @@ def _particles_to_grid(
     B = mass[:, :, None] * C
     B = B if to_B is None else B + to_B
     payload = Payload(jnp.concatenate([mass * v, mass], axis=1), B, to_S)
-    sums = scatter(scene.grid, at, payload)
-    grid_mass, momentum = sums[..., d:], sums[..., :d]
-    return grid_mass, safe_divide(momentum, jnp.broadcast_to(grid_mass, momentum.shape))
+    return scatter(scene.grid, at, payload)
 
 
 def _forces_and_boundaries(
-    scene: Scene,
-    grid_mass: Float[Array, "*grid 1"],
-    grid_v: Float[Array, "*grid d"],
-    t: Scalar,
-    dt: Scalar,
+    scene: Scene, at: Stencil, momentum_and_mass: Float[Array, "*grid c"], t: Scalar, dt: Scalar
 ) -> Float[Array, "*grid d"]:
-    """Gravity, damping `exp(−γ Δt)`, then each condition in order; empty nodes stay at rest."""
-    d = scene.grid.dimension
-    v = grid_v.reshape(-1, d) + (dt * scene.gravity)[None, :]
-    v = v * jnp.exp(-scene.grid_damping * dt)
-    x = scene.grid.nodes().reshape(-1, d) + scene.grid.origin[None, :]
-    for condition in scene.boundaries:
-        v = jax.vmap(condition, in_axes=(0, 0, None))(x, v, t)
-    return jnp.where(grid_mass > 0, v.reshape(grid_v.shape), 0)
+    """Velocity of the nodes: gravity, damping `exp(−γ Δt)`, then each condition in order.
+
+    Empty nodes stay at rest.
+    """
+    kept = jnp.exp(-scene.grid_damping * dt)
+
+    def velocity(x: Vectors, momentum_and_mass: Float[Array, "c n"], region: Region) -> Vectors:
+        momentum, mass = momentum_and_mass[:-1], momentum_and_mass[-1]
+        v = safe_divide(momentum, jnp.broadcast_to(mass, momentum.shape))
+        v = (v + (dt * scene.gravity)[:, None]) * kept
+        for condition in scene.boundaries:
+            if isinstance(condition, AbstractGridCondition):
+                v = condition.on_nodes(x, v, t, region)
+            else:
+                v = jax.vmap(condition, in_axes=(1, 1, None), out_axes=1)(x, v, t)
+        return jnp.where(mass > 0, v, 0)
+
+    return sweep(scene.grid, velocity, momentum_and_mass, _region(scene.grid, at))
+
+
+def _region(grid: Grid, at: Stencil) -> Region:
+    """The box of all nodes that can have mass, half a cell wider on each side."""
+    first, last = at.span()
+    wide = np.asarray(grid.periodic)
+    low = jnp.where(wide, -jnp.inf, (first - 0.5) * grid.h + grid.origin)
+    high = jnp.where(wide, jnp.inf, (last + 0.5) * grid.h + grid.origin)
+    return Region(low, high)
 
 
 def _grid_to_particles(

@@ -5,14 +5,17 @@ nodes on a wall and everything behind it are held, wherever the grid lies.
 """
 
 import abc
-from collections.abc import Callable
+import functools
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
+from pgjax._safe import dot
 from pgjax._types import (
     Array,
+    Bool,
     Float,
     Scalar,
     as_float_array,
@@ -23,18 +26,32 @@ from pgjax._types import (
 )
 from pgjax.boundary.contact import AbstractContact, Separating, Sticky
 from pgjax.boundary.motion import AbstractMotion
+from pgjax.boundary.nodes import Region
 from pgjax.boundary.shapes import AbstractShape, normal
 from pgjax.boundary.window import require_window, within
 
 Vector = Float[Array, " d"]
+Vectors = Float[Array, "d n"]
 
 
 class AbstractGridCondition(eqx.Module):
-    """A boundary condition of the grid."""
+    """A boundary condition of the grid. A new one implements `__call__` only."""
 
     @abc.abstractmethod
     def __call__(self, x: Vector, v: Vector, t: Scalar) -> Vector:
         """New velocity of the node at x at time t."""
+
+    def on_nodes(self, x: Vectors, v: Vectors, t: Scalar, region: Region) -> Vectors:
+        """The same for many nodes, components first, which makes vector code of it.
+
+        Args:
+            x: `(d, n)`, m.
+            v: `(d, n)`, m/s.
+            t: s.
+            region: holds every node that matters; the others have no mass.
+        """
+        del region
+        return jax.vmap(self, in_axes=(1, 1, None), out_axes=1)(x, v, t)
 
 
 @final
@@ -89,30 +106,36 @@ class Collider(AbstractGridCondition):
 
     def __call__(self, x: Vector, v: Vector, t: Scalar) -> Vector:
         """Apply the contact on the body and inside it."""
-        if self.motion is None:
-            wall = jnp.zeros_like(v) if self.surface_velocity is None else self.surface_velocity
-            return self._touched(x, x, v, t, wall, lambda n: n)
-        pose = self.motion.at(t)
-        wall = pose.velocity_at(x)
-        if self.surface_velocity is not None:
-            wall = wall + pose.turned(self.surface_velocity)
-        return self._touched(x, pose.to_rest(x), v, t, wall, pose.turned)
+        return jnp.where(self._holds(x, t), self._touched(x, v, t), v)
 
-    def _touched(
-        self,
-        x: Vector,
-        at_rest: Vector,
-        v: Vector,
-        t: Scalar,
-        wall: Vector,
-        turned: Callable[[Vector], Vector],
-    ) -> Vector:
-        n = turned(normal(self.shape, at_rest))
+    def on_nodes(self, x: Vectors, v: Vectors, t: Scalar, region: Region) -> Vectors:
+        """The same, if any node of the region is in the body."""
+        inside = jax.vmap(self._holds, in_axes=(1, None))(x, t)
+        inside = inside & region.holds(x)
+
+        def touched(v: Vectors) -> Vectors:
+            new = jax.vmap(self._touched, in_axes=(1, 1, None), out_axes=1)(x, v, t)
+            return jnp.where(inside, new, v)
+
+        return jax.lax.cond(jnp.any(inside), touched, lambda v: v, v)
+
+    def _holds(self, x: Vector, t: Scalar) -> Bool[Array, ""]:
+        at_rest = x if self.motion is None else self.motion.at(t).to_rest(x)
         inside = self.shape.signed_distance(at_rest) <= _tolerance(x, at_rest)
-        active = within(t, self.start, self.end)
+        return inside & within(t, self.start, self.end)
+
+    def _touched(self, x: Vector, v: Vector, t: Scalar) -> Vector:
+        """The velocity of a node in the body."""
+        wall = jnp.zeros_like(v) if self.surface_velocity is None else self.surface_velocity
+        if self.motion is None:
+            n = normal(self.shape, x)
+        else:
+            pose = self.motion.at(t)
+            n = pose.turned(normal(self.shape, pose.to_rest(x)))
+            wall = pose.velocity_at(x) + pose.turned(wall)
         # Without a normal (in the centre of a sphere) the material moves with the body.
-        contact = jnp.where(jnp.any(n != 0), self.contact(v - wall, n), Sticky()(v, n))
-        return jnp.where(inside & active, wall + contact, v)
+        contact = jnp.where(dot(n, n) != 0, self.contact(v - wall, n), Sticky()(v, n))
+        return wall + contact
 
 
 @final
@@ -143,17 +166,32 @@ class Box(AbstractGridCondition):
 
     def __call__(self, x: Vector, v: Vector, t: Scalar) -> Vector:
         """Apply the contact at each wall in turn."""
+        anywhere = jnp.full_like(x, jnp.inf)
+        return self.on_nodes(x[:, None], v[:, None], t, Region(-anywhere, anywhere))[:, 0]
+
+    def on_nodes(self, x: Vectors, v: Vectors, t: Scalar, region: Region) -> Vectors:
+        """Each pair of walls in turn, if the region reaches one of them."""
         del t
-        d = x.shape[0]
-        for axis in range(d):
-            for sign, corner in ((1, self.lower), (-1, self.upper)):
-                inward = jnp.zeros_like(x).at[axis].set(sign)
-                behind = sign * (x[axis] - corner[axis]) <= _tolerance(x, corner)
-                v = jnp.where(behind, self.contact(v, inward), v)
+        for axis in range(x.shape[0]):
+            # The region is half a cell too wide, which is more than rounding.
+            low = region.low[axis] <= self.lower[axis]
+            high = region.high[axis] >= self.upper[axis]
+            walls = functools.partial(self._walls, axis, x)
+            v = jax.lax.cond(low | high, walls, lambda v: v, v)
         return v
 
+    def _walls(self, axis: int, x: Vectors, v: Vectors) -> Vectors:
+        """The two walls across one direction; no node is behind both."""
+        low = x[axis] - self.lower[axis] <= _tolerance(x, self.lower[:, None])
+        high = self.upper[axis] - x[axis] <= _tolerance(x, self.upper[:, None])
+        sign = jnp.where(high, -1, 1).astype(v.dtype)
+        inward = jnp.stack([sign if i == axis else 0 * sign for i in range(x.shape[0])])
+        touched = jax.vmap(self.contact, in_axes=(1, 1), out_axes=1)(v, inward)
+        return jnp.where(low | high, touched, v)
 
-def _tolerance(x: Vector, *others: Vector) -> Scalar:
+
+def _tolerance(x: Array, *others: Array) -> Array:
     """A node that lies on a wall up to rounding counts as on the wall; no absolute length."""
-    size = jnp.max(jnp.abs(jnp.stack([x, *others])))
+    entries = [jnp.abs(a[i]) for a in (x, *others) for i in range(a.shape[0])]
+    size = functools.reduce(jnp.maximum, entries)
     return 16 * jnp.asarray(jnp.finfo(x.dtype).eps, x.dtype) * size

@@ -6,7 +6,7 @@ from typing import final
 import equinox as eqx
 import jax.numpy as jnp
 
-from pgjax._safe import safe_divide, safe_norm
+from pgjax._safe import dot, safe_divide, safe_norm
 from pgjax._types import Array, Float, nonnegative, parameter, require
 
 Vector = Float[Array, " d"]
@@ -36,7 +36,7 @@ class Slip(AbstractContact):
 
     def __call__(self, v: Vector, normal: Vector) -> Vector:
         """`v ← v − (v·n) n`."""
-        return v - jnp.sum(v * normal) * normal
+        return v - dot(v, normal) * normal
 
 
 @final
@@ -54,7 +54,7 @@ class Separating(AbstractContact):
 
     def __call__(self, v: Vector, normal: Vector) -> Vector:
         """`v ← v_t max(0, 1 − μ |v_n|/|v_t|)` if `v_n = v·n < 0`, else unchanged."""
-        normal_speed = jnp.sum(v * normal)
+        normal_speed = dot(v, normal)
         tangential = v - normal_speed * normal
         speed = safe_norm(tangential)
         # The impulse that stops the normal motion also brakes the sliding, at most to rest.

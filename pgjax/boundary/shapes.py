@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pgjax._safe import safe_divide, safe_norm
+from pgjax._safe import dot, safe_divide, safe_norm
 from pgjax._types import (
     Array,
     Float,
@@ -59,7 +59,7 @@ class HalfSpace(AbstractShape):
 
     def signed_distance(self, x: Vector) -> Scalar:
         """`(x − point)·n`."""
-        return jnp.sum((x - self.point) * self.normal) / safe_norm(self.normal)
+        return dot(x - self.point, self.normal) / safe_norm(self.normal)
 
 
 @final
@@ -144,7 +144,7 @@ class Cylinder(AbstractShape):
         length = safe_norm(self.end - self.start)
         axis = (self.end - self.start) / length
         r = x - (self.start + self.end) / 2
-        along = jnp.sum(r * axis)
+        along = dot(r, axis)
         across = safe_norm(r - along * axis)
         return _outside_and_inside(jnp.stack([jnp.abs(along) - length / 2, across - self.radius]))
 
@@ -169,7 +169,7 @@ class Capsule(AbstractShape):
     def signed_distance(self, x: Vector) -> Scalar:
         """`|x − nearest point of the segment| − radius`."""
         along = self.end - self.start
-        s = jnp.sum((x - self.start) * along) / jnp.sum(along * along)
+        s = dot(x - self.start, along) / dot(along, along)
         return safe_norm(x - self.start - jnp.clip(s, 0, 1) * along) - self.radius
 
 

@@ -166,7 +166,7 @@ PGJAX_INLINE T first_node(T xi) {
 }
 
 // Weights of the B-spline of degree K - 1, and their first and second derivatives. Written so that
-// sum w = 1 and sum w' = 0 hold up to one rounding (as in pgjax/splines.py).
+// sum w = 1 and sum w' = 0 hold up to one rounding.
 template <class T, int K>
 PGJAX_INLINE void spline(T offset, T w[K], T dw[K], T ddw[K]) {
   if constexpr (K == 3) {

@@ -45,6 +45,18 @@ class Stencil(eqx.Module):
         base = jax.vmap(self.spline.base)(jax.lax.stop_gradient(self.xi))
         return base.astype(jnp.int32) + PAD
 
+    def span(self) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+        """The first and the last node of all stencils, in cells from the grid's origin."""
+        xi = jax.lax.stop_gradient(self.xi)
+
+        def both(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+            return jnp.minimum(a[0], b[0]), jnp.maximum(a[1], b[1])
+
+        # In one pass over the particles.
+        infinity = jnp.asarray(jnp.inf, xi.dtype)
+        least, most = jax.lax.reduce((xi, xi), (infinity, -infinity), both, dimensions=(0,))
+        return self.spline.base(least), self.spline.base(most) + self.spline.degree
+
 
 def stencil(
     grid: Grid, spline: BSpline, x: Float[Array, "p d"]

@@ -1,0 +1,74 @@
+"""Conditions of the grid on all its nodes at once, evaluated where there is mass only."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pgjax._types import Array, Bool, Float
+from pgjax.grid import Grid
+
+Vector = Float[Array, " d"]
+Vectors = Float[Array, "d n"]
+
+# A loop over a slab of fewer nodes costs more than it saves.
+_SMALLEST_SLAB = 2048
+
+
+class Region(NamedTuple):
+    """A box that holds every node with mass, m: corners `(d,)`."""
+
+    low: Vector
+    high: Vector
+
+    def holds(self, x: Vectors) -> Bool[Array, " n"]:
+        """Which of the nodes at x are in it."""
+        return jnp.all((x >= self.low[:, None]) & (x <= self.high[:, None]), axis=0)
+
+
+def sweep(
+    grid: Grid,
+    one: Callable[[Vectors, Float[Array, "c n"], Region], Vectors],
+    values: Float[Array, "*grid c"],
+    region: Region,
+) -> Float[Array, "*grid d"]:
+    """`one(x, values, region)` for the nodes of every slab that reaches into the region, else 0.
+
+    A slab is a few layers of nodes across the first direction. Components come first, `(d, n)`:
+    what is written for one node then becomes vector code over many.
+
+    Args:
+        grid: the grid.
+        one: a vector for each of n nodes at x, m, from their values.
+        values: of the nodes.
+        region: where there is mass.
+    """
+    d = grid.dimension
+    first, *others = (a + start for a, start in zip(grid.axes(), grid.origin, strict=True))
+    layers = _layers(grid.node_shape)
+
+    def occupied(out: Array, start: Array, x0: Float[Array, " k"], region: Region) -> Array:
+        x = jnp.stack(jnp.meshgrid(x0, *others, indexing="ij")).reshape(d, -1)
+        here = jax.lax.dynamic_slice_in_dim(values, start, layers)
+        new = one(x, here.reshape(-1, here.shape[-1]).T, region)
+        new = new.T.reshape(*here.shape[:-1], d)
+        return jax.lax.dynamic_update_slice_in_dim(out, new, start, 0)
+
+    def slab(out: Array, start: Array) -> tuple[Array, None]:
+        x0 = jax.lax.dynamic_slice_in_dim(first, start, layers)
+        low, high = region.low.at[0].max(x0[0]), region.high.at[0].min(x0[-1])
+        args = out, start, x0, Region(low, high)
+        return jax.lax.cond(low[0] <= high[0], occupied, lambda out, *_: out, *args), None
+
+    out = jnp.zeros((*grid.node_shape, d), values.dtype)
+    starts = jnp.arange(0, grid.node_shape[0], layers, dtype=jnp.int32)
+    return jax.lax.scan(slab, out, starts)[0]
+
+
+def _layers(nodes: Sequence[int]) -> int:
+    """How many layers of nodes make a slab: a divisor of their number."""
+    across = math.prod(nodes[1:])
+    divisors = (k for k in range(1, nodes[0]) if nodes[0] % k == 0)
+    return next((k for k in divisors if k * across >= _SMALLEST_SLAB), nodes[0])
