@@ -14,12 +14,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
 
-from pgjax import native
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Matrix3, Scalar, Vector3
+from pgjax.native.particles import per_particle
 
 # Cyclic Jacobi converges quadratically: errors after these are at rounding level.
 _SWEEPS = {"float32": 4, "float64": 6}
@@ -71,7 +69,7 @@ def eigenbasis(A: Matrix3) -> tuple[Vector3, Matrix3]:
         `w (3,)` and `Q (3, 3)` with `A = Q diag(w) Qᵀ`, error about 1e-6 (float32) or
         1e-15 (float64) of the largest eigenvalue. `Q` may be a reflection.
     """
-    w, Q = eigenbasis_p.bind(jax.lax.stop_gradient(A))
+    w, Q = _eigenbasis_call(jax.lax.stop_gradient(A))
     return w, Q
 
 
@@ -93,40 +91,7 @@ def _eigenbasis(A: Matrix3) -> tuple[Vector3, Matrix3]:
     return jnp.stack(w) * scale, jnp.stack([jnp.stack(row) for row in q])
 
 
-def _eigenbases(A: Float[Array, "*n 3 3"]) -> tuple[Array, Array]:
-    """`_eigenbasis` over any leading axes."""
-    one = _eigenbasis
-    for _ in A.shape[:-2]:
-        one = jax.vmap(one)
-    return one(A)
-
-
-def _native_eigenbases(A: Float[Array, "*n 3 3"]) -> tuple[Array, Array]:
-    """The same by the native kernel, if there is one."""
-    library = native.library("eigen", jnp.dtype(A.dtype).name)
-    if library is None:
-        return _eigenbases(A)
-    flat = A.reshape(-1, 3, 3)
-    returned = [jax.ShapeDtypeStruct(shape, A.dtype) for shape in (flat.shape[:2], flat.shape)]
-    w, Q = jax.ffi.ffi_call(library.targets["eigenbasis"], returned)(flat)
-    return w.reshape(A.shape[:-1]), Q.reshape(A.shape)
-
-
-def _eigenbasis_batch(operands: tuple[Array], axes: tuple[int]) -> tuple[list[Array], list[int]]:
-    return eigenbasis_p.bind(jnp.moveaxis(operands[0], axes[0], 0)), [0, 0]
-
-
-eigenbasis_p = Primitive("pgjax_eigenbasis")
-eigenbasis_p.multiple_results = True
-eigenbasis_p.def_impl(functools.partial(native.run, eigenbasis_p))
-eigenbasis_p.def_abstract_eval(
-    lambda A: [native.result_type(A, A.shape[:-1]), native.result_type(A, A.shape)]
-)
-batching.primitive_batchers[eigenbasis_p] = _eigenbasis_batch
-mlir.register_lowering(eigenbasis_p, mlir.lower_fun(_eigenbases, multiple_results=True))
-mlir.register_lowering(
-    eigenbasis_p, mlir.lower_fun(_native_eigenbases, multiple_results=True), platform="cpu"
-)
+_eigenbasis_call = per_particle("eigenbasis", "eigen", _eigenbasis, [2])
 
 
 @jax.custom_jvp
@@ -315,6 +280,13 @@ def det(A: Matrix3) -> Scalar:
 def cofactor(A: Matrix3) -> Matrix3:
     """Cofactor matrix, `det(A) A⁻ᵀ` written without a division: finite for singular A."""
     return jnp.stack([jnp.cross(A[1], A[2]), jnp.cross(A[2], A[0]), jnp.cross(A[0], A[1])])
+
+
+def volume_change(H: Matrix3) -> Scalar:
+    """`J − 1 = tr H + (tr²H − tr H²)/2 + det H`: the invariants, without cancellation."""
+    trace = jnp.trace(H)
+    second = (trace * trace - jnp.sum(H * H.T)) / 2
+    return trace + second + jnp.sum(H[0] * cofactor(H)[0])
 
 
 def deviator(A: Matrix3) -> Matrix3:

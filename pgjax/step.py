@@ -12,7 +12,6 @@ from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Scalar
 from pgjax.boundary import AbstractGridCondition, Particles, Region, sweep
 from pgjax.grid import Grid
-from pgjax.models.elasticity import volume_change
 from pgjax.models.material import cast, particle_axes
 from pgjax.result import Condition
 from pgjax.scene import Scene
@@ -89,8 +88,7 @@ def _stress(scene: Scene, state: State, t: Scalar) -> tuple[State, Stencil, Floa
     for material, part, history in zip(scene.materials, scene.slices, state.history, strict=True):
 
         def law(material, H, total, L, history):
-            stress = material.kirchhoff(H, total, L, history, t)
-            return stress, volume_change(H) <= -1, material.elasticity.clamped(H, history)
+            return material.response(H, total, L, history, t)
 
         axes = (particle_axes(material, part.stop - part.start), 0, 0, 0, 0)
         one = jax.vmap(law, in_axes=axes)

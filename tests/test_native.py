@@ -44,7 +44,7 @@ def test_eigenbasis_of_both(monkeypatch):
     A = jnp.asarray(A + np.swapaxes(A, -1, -2), jnp.zeros(()).dtype)
     # The inner vmap along the first axis: a batch axis that has to be moved.
     w, Q = jax.jit(jax.vmap(jax.vmap(linalg.eigenbasis), in_axes=1, out_axes=1))(A)
-    plain, _ = jax.jit(linalg._eigenbases)(A)
+    plain, _ = jax.jit(jax.vmap(jax.vmap(linalg._eigenbasis)))(A)
     size = jnp.max(jnp.abs(A), axis=(-1, -2))
     eps = float(jnp.finfo(A.dtype).eps)
     assert jnp.all(jnp.abs(w - plain) <= 16 * eps * size[..., None])

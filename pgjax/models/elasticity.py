@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 
 from pgjax._types import Array, Matrix3, Scalar, Vector3, parameter
-from pgjax.linalg import cofactor, deviator, eigenbasis, spectral_map
-from pgjax.models.law import AbstractElasticity
+from pgjax.linalg import deviator, eigenbasis, spectral_map
+from pgjax.linalg import volume_change as volume_change
+from pgjax.models.law import AbstractElasticity, Response
+from pgjax.native.particles import per_particle
 
 # Below these, logarithms are continued (module docstring of each law says how), so that a
 # crushed or inverted particle is pushed back instead of turning into NaN.
@@ -28,13 +30,6 @@ def identity(like: Matrix3) -> Matrix3:
 def left_strain(H: Matrix3) -> Matrix3:
     """`B = F Fᵀ − I = H + Hᵀ + H Hᵀ`, without the cancellation of forming F."""
     return H + H.T + H @ H.T
-
-
-def volume_change(H: Matrix3) -> Scalar:
-    """`J − 1 = tr H + (tr²H − tr H²)/2 + det H`: the invariants, without cancellation."""
-    trace = jnp.trace(H)
-    second = (trace * trace - jnp.sum(H * H.T)) / 2
-    return trace + second + jnp.sum(H[0] * cofactor(H)[0])
 
 
 def log_volume(H: Matrix3) -> tuple[Scalar, Scalar]:
@@ -124,6 +119,32 @@ def stretch_minus_identity(H: Matrix3) -> Matrix3:
     return spectral_map(left_strain(H), Q, values, divided)
 
 
+def _fixed_corotated_stress(H: Matrix3, mu: Scalar, lam: Scalar) -> tuple[Matrix3, Scalar]:
+    """Stress and J − 1. The native kernels below compute the same as their plain functions."""
+    change = volume_change(H)
+    shear = left_strain(H) - stretch_minus_identity(H)
+    return 2 * mu * shear + lam * (1 + change) * change * identity(H), change
+
+
+def _stvk_hencky_stress(H: Matrix3, mu: Scalar, lam: Scalar) -> tuple[Matrix3, Scalar, Scalar]:
+    """Stress, J − 1 and the smallest stretch."""
+    eps, _ = hencky_strain(H)
+    smallest = principal_stretches(H)[0][2]
+    return 2 * mu * eps + lam * jnp.trace(eps) * identity(H), volume_change(H), smallest
+
+
+def _neo_hookean_stress(H: Matrix3, mu: Scalar, lam: Scalar) -> tuple[Matrix3, Scalar]:
+    """Stress and J − 1."""
+    log_J, _ = log_volume(H)
+    return mu * left_strain(H) + lam * log_J * identity(H), volume_change(H)
+
+
+_OPERANDS = (2, 0, 0)
+_fixed_corotated = per_particle("fixed_corotated", "laws", _fixed_corotated_stress, _OPERANDS)
+_stvk_hencky = per_particle("stvk_hencky", "laws", _stvk_hencky_stress, _OPERANDS)
+_neo_hookean = per_particle("neo_hookean", "laws", _neo_hookean_stress, _OPERANDS)
+
+
 @final
 class FixedCorotated(AbstractElasticity):
     """Fixed corotated elasticity (Stomakhin et al. 2012).
@@ -140,11 +161,13 @@ class FixedCorotated(AbstractElasticity):
 
     def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
         """`τ = 2μ (b − V) + λ J (J − 1) I`, Pa."""
+        return self.response(H, L, history).tau
+
+    def response(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Response:
+        """The stress and what the status counts; the law is never clamped."""
         del L, history
-        change = volume_change(H)
-        pressure = self.lam * (1 + change) * change
-        shear = left_strain(H) - stretch_minus_identity(H)
-        return 2 * self.mu * shear + pressure * identity(H)
+        tau, change = _fixed_corotated(H, self.mu, self.lam)
+        return Response(tau, change <= -1, jnp.zeros((), bool))
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
         """`μ Σ (σ − 1)² + λ/2 (J − 1)²`, J/m³ of rest volume."""
@@ -183,9 +206,13 @@ class StVKHencky(AbstractElasticity):
 
     def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
         """`τ = 2μ ε + λ tr(ε) I`, Pa."""
+        return self.response(H, L, history).tau
+
+    def response(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Response:
+        """The stress and what the status counts."""
         del L, history
-        eps, _ = hencky_strain(H)
-        return 2 * self.mu * eps + self.lam * jnp.trace(eps) * identity(H)
+        tau, change, smallest = _stvk_hencky(H, self.mu, self.lam)
+        return Response(tau, change <= -1, smallest < SMALLEST_STRETCH)
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
         """`μ ‖ε‖² + λ/2 tr²(ε)`, J/m³ of rest volume."""
@@ -237,9 +264,13 @@ class NeoHookean(AbstractElasticity):
 
     def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
         """`τ = μ B + λ log J I`, Pa."""
+        return self.response(H, L, history).tau
+
+    def response(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Response:
+        """The stress and what the status counts."""
         del L, history
-        log_J, _ = log_volume(H)
-        return self.mu * left_strain(H) + self.lam * log_J * identity(H)
+        tau, change = _neo_hookean(H, self.mu, self.lam)
+        return Response(tau, change <= -1, change <= SMALLEST_VOLUME_RATIO - 1)
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
         """`μ/2 (tr B − 2 log J) + λ/2 log²J`, J/m³ of rest volume (J > 0.01)."""

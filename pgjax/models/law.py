@@ -1,11 +1,27 @@
 """What the simulator asks of a constitutive law, and the base of the elastic ones."""
 
 import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from pgjax._types import Array, Matrix3, Scalar, require
+from pgjax._types import Array, Bool, Matrix3, Scalar, require
+from pgjax.linalg import volume_change
+
+
+class Response(NamedTuple):
+    """What a step asks of a law.
+
+    Attributes:
+        tau: Kirchhoff stress, Pa, `(3, 3)`.
+        inverted: whether det F ≤ 0.
+        clamped: whether the law had to continue itself beyond its domain.
+    """
+
+    tau: Matrix3
+    inverted: Bool[Array, ""]
+    clamped: Bool[Array, ""]
 
 
 class AbstractLaw(eqx.Module):
@@ -18,6 +34,11 @@ class AbstractLaw(eqx.Module):
         `L` is the affine velocity (1/s) for laws with viscosity, `history` what the material's
         return map carries; a purely elastic law uses neither.
         """
+
+    def response(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Response:
+        """The stress and what the status counts, at once: some laws share work between them."""
+        tau = self.kirchhoff(H, L, history)
+        return Response(tau, volume_change(H) <= -1, self.clamped(H, history))
 
     @abc.abstractmethod
     def rest_modulus(self, dimension: int) -> Array:

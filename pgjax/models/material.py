@@ -8,7 +8,7 @@ import jax
 
 from pgjax._types import Array, Matrix3, Scalar, is_parameter, parameter, require
 from pgjax.models.active import ActiveStress
-from pgjax.models.law import AbstractElasticity, AbstractLaw
+from pgjax.models.law import AbstractElasticity, AbstractLaw, Response
 from pgjax.models.plasticity import AbstractPlasticity
 
 
@@ -64,8 +64,16 @@ class Material(eqx.Module):
         self, H: Matrix3, total: Matrix3, L: Matrix3, history: Array | None, t: Scalar
     ) -> Matrix3:
         """Kirchhoff stress of one particle, Pa, from elastic and total `F − I` (`H`, `total`)."""
-        tau = self.elasticity.kirchhoff(H, L, history)
-        return tau if self.active is None else tau + self.active.kirchhoff(total, t)
+        return self.response(H, total, L, history, t).tau
+
+    def response(
+        self, H: Matrix3, total: Matrix3, L: Matrix3, history: Array | None, t: Scalar
+    ) -> Response:
+        """The same with what the status counts."""
+        response = self.elasticity.response(H, L, history)
+        if self.active is None:
+            return response
+        return response._replace(tau=response.tau + self.active.kirchhoff(total, t))
 
     def rest_modulus(self, dimension: int) -> Array:
         """`ρ₀ c²` at rest, Pa."""

@@ -7,6 +7,7 @@ new elastic deformation is `Fe ← exp(Δε) Fe`, written on `H = Fe − I` as `
 
 import abc
 import functools
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 
 from pgjax._safe import frobenius, safe_divide
 from pgjax._types import Array, Matrix3, Scalar, as_float_array, nonnegative, parameter, require
-from pgjax.linalg import cofactor, deviator, spectral_map
+from pgjax.linalg import cofactor, deviator, spectral_map, volume_change
 from pgjax.models.elasticity import (
     AbstractElasticity,
     DevVolNeoHookean,
@@ -24,8 +25,8 @@ from pgjax.models.elasticity import (
     identity,
     isochoric_strain,
     principal_stretches,
-    volume_change,
 )
+from pgjax.native.particles import per_particle
 
 _ROOT_2_3 = (2 / 3) ** 0.5
 
@@ -68,23 +69,85 @@ class AbstractHenckyPlasticity(AbstractPlasticity):
     ) -> tuple[Matrix3, Array, Array | None]:
         """From the trial Hencky strain: the new one, whether it changed, and the new history."""
 
-    @final
     def return_map(
         self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
     ) -> tuple[Matrix3, Array | None]:
         """`Fe ← exp(ε − ε_trial) Fe_trial`."""
         del dt
-        trial, Q = hencky_strain(H)
-        eps, yields, new = self.flow(trial, history, elasticity)
-        upright = volume_change(H) > -1
-        yields = yields & upright
-        history = jax.tree.map(functools.partial(jnp.where, upright), new, history)
-        M = _expm1_map(jnp.where(yields, eps - trial, 0), Q)
-        return jnp.where(yields, H + M + M @ H, H), history
+        return _along(lambda eps: self.flow(eps, history, elasticity), H, history)
+
+
+def _along(
+    flow: Callable[[Matrix3], tuple[Matrix3, Array, Any]], H: Matrix3, history: Any
+) -> tuple[Matrix3, Any]:
+    """The flow of a Hencky strain, carried over to H. An inverted particle does not flow."""
+    trial, Q = hencky_strain(H)
+    eps, yields, new = flow(trial)
+    upright = volume_change(H) > -1
+    yields = yields & upright
+    history = jax.tree.map(functools.partial(jnp.where, upright), new, history)
+    M = _expm1_map(jnp.where(yields, eps - trial, 0), Q)
+    return jnp.where(yields, H + M + M @ H, H), history
+
+
+def _radial_return(eps: Matrix3, tau_Y: Scalar, mu: Scalar) -> tuple[Matrix3, Array, Scalar]:
+    """The strain returned to the von Mises surface, whether it was outside, and δγ."""
+    shear = deviator(eps)
+    norm = frobenius(shear)
+    yields = norm > tau_Y / (2 * mu)
+    # The argument is guarded, not the result: an infinite τ_Y must not reach a derivative.
+    dgamma = norm - jnp.where(yields, tau_Y, 0) / (2 * mu)
+    dgamma = jnp.where(yields, dgamma, 0)
+    return eps - dgamma * safe_divide(shear, norm * jnp.ones_like(shear)), yields, dgamma
+
+
+def _cone_return(
+    eps: Matrix3, slope: Scalar, apex: Scalar, gained: Scalar, *, correct: bool
+) -> tuple[Matrix3, Array, Scalar]:
+    """The strain returned to the cone or its tip, whether it changes, and the volume gained."""
+    I = identity(eps)
+    moved = eps + (gained / 3 - apex) * I
+    shear, trace = deviator(moved), jnp.trace(moved)
+    norm = frobenius(shear)
+    dgamma = norm + slope * trace
+    tip, cone = trace > 0, (trace <= 0) & (dgamma > 0)
+    returned = moved - dgamma * safe_divide(shear, norm * jnp.ones_like(shear))
+    flowed = jnp.where(tip, 0, returned) + apex * I
+    yields = tip | cone
+    if not correct:
+        return flowed, yields, gained
+    # Inside the cone the volume gained before is given back in full.
+    new = jnp.where(yields, flowed, eps + gained / 3 * I)
+    gained = jnp.where(yields, gained + jnp.trace(eps) - jnp.trace(new), 0)
+    return new, jnp.ones_like(yields), gained
+
+
+def _map_von_mises(H: Matrix3, tau_Y: Scalar, mu: Scalar) -> tuple[Matrix3, Scalar]:
+    """H and δγ. The native kernels below compute the same as their plain functions."""
+    return _along(lambda eps: _radial_return(eps, tau_Y, mu), H, jnp.zeros_like(mu))
+
+
+def _map_drucker_prager(
+    H: Matrix3, slope: Scalar, apex: Scalar, gained: Scalar, *, correct: bool
+) -> tuple[Matrix3, Scalar]:
+    """H and the volume gained."""
+    return _along(lambda eps: _cone_return(eps, slope, apex, gained, correct=correct), H, gained)
+
+
+_von_mises = per_particle("von_mises", "laws", _map_von_mises, (2, 0, 0))
+_drucker_prager = {
+    correct: per_particle(
+        "drucker_prager",
+        "laws",
+        functools.partial(_map_drucker_prager, correct=correct),
+        (2, 0, 0, 0),
+    )
+    for correct in (False, True)
+}
 
 
 @final
-class VonMises(AbstractHenckyPlasticity):
+class VonMises(AbstractPlasticity):
     """Von Mises plasticity, linear isotropic hardening or softening; goes with `StVKHencky`.
 
     `δγ = ‖ε̂‖ − τ_Y/(2μ)`; if positive, `ε ← ε − δγ ε̂/‖ε̂‖`, and then `τ_Y ← τ_Y + 2μ ξ δγ`
@@ -139,23 +202,18 @@ class VonMises(AbstractHenckyPlasticity):
             return jnp.where(left > 0, left, 0)
         return tau_Y
 
-    def flow(
-        self, eps: Matrix3, history: Array | None, elasticity: AbstractElasticity
-    ) -> tuple[Matrix3, Array, Array | None]:
-        """Radial return of the deviator."""
-        tau_Y = self.current_yield_stress(history, elasticity.mu)
-        shear = deviator(eps)
-        norm = frobenius(shear)
-        yields = norm > tau_Y / (2 * elasticity.mu)
-        # The argument is guarded, not the result: an infinite τ_Y must not reach a derivative.
-        dgamma = norm - jnp.where(yields, tau_Y, 0) / (2 * elasticity.mu)
-        dgamma = jnp.where(yields, dgamma, 0)
-        new = eps - dgamma * safe_divide(shear, norm * jnp.ones_like(shear))
-        return new, yields, None if history is None else history + dgamma
+    def return_map(
+        self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
+    ) -> tuple[Matrix3, Array | None]:
+        """Radial return of the deviator of the Hencky strain."""
+        del dt
+        mu = elasticity.mu
+        H, dgamma = _von_mises(H, self.current_yield_stress(history, mu), mu)
+        return H, None if history is None else history + dgamma
 
 
 @final
-class DruckerPrager(AbstractHenckyPlasticity):
+class DruckerPrager(AbstractPlasticity):
     """Drucker–Prager sand (Klár et al. 2016); goes with `StVKHencky`.
 
     `δγ = ‖ε̂‖ + α (3λ + 2μ)/(2μ) tr ε`, `α = √(2/3) 2 sin φ/(3 − sin φ)`. `tr ε > 0`: `ε ← 0`
@@ -195,29 +253,18 @@ class DruckerPrager(AbstractHenckyPlasticity):
         """The volume gained at the tip (log strain), if it is corrected."""
         return 0.0 if self.volume_correction else None
 
-    def flow(
-        self, eps: Matrix3, history: Array | None, elasticity: AbstractElasticity
-    ) -> tuple[Matrix3, Array, Array | None]:
-        """Return to the cone along the deviator, or to its tip."""
-        I = identity(eps)
-        zero = jnp.zeros((), eps.dtype)
+    def return_map(
+        self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
+    ) -> tuple[Matrix3, Array | None]:
+        """Return of the Hencky strain to the cone along its deviator, or to the tip."""
+        del dt
+        zero = jnp.zeros((), H.dtype)
+        mu, lam = elasticity.mu, elasticity.lam
+        slope = self.alpha * (3 * lam + 2 * mu) / (2 * mu)
         apex = zero if self.cohesion is None else self.cohesion
         gained = zero if history is None else history
-        moved = eps + (gained / 3 - apex) * I
-        shear, trace = deviator(moved), jnp.trace(moved)
-        norm = frobenius(shear)
-        mu, lam = elasticity.mu, elasticity.lam
-        dgamma = norm + self.alpha * (3 * lam + 2 * mu) / (2 * mu) * trace
-        tip, cone = trace > 0, (trace <= 0) & (dgamma > 0)
-        returned = moved - dgamma * safe_divide(shear, norm * jnp.ones_like(shear))
-        flowed = jnp.where(tip, 0, returned) + apex * I
-        yields = tip | cone
-        if history is None:
-            return flowed, yields, None
-        # Inside the cone the volume gained before is given back in full.
-        new = jnp.where(yields, flowed, eps + gained / 3 * I)
-        history = jnp.where(yields, gained + jnp.trace(eps) - jnp.trace(new), 0)
-        return new, jnp.ones_like(yields), history
+        H, gained = _drucker_prager[self.volume_correction](H, slope, apex, gained)
+        return H, None if history is None else gained
 
 
 def _h_or_one(h: Any) -> Array | None:

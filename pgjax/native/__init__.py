@@ -27,10 +27,13 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.sharding import NamedSharding, PartitionSpec
 
+from pgjax._types import Array
+
 # What each source holds.
 HANDLERS = {
     "transfer": ("scatter", "scatter_tangent", "gather", "gather_tangent", "pull"),
     "eigen": ("eigenbasis",),
+    "laws": ("neo_hookean", "fixed_corotated", "stvk_hencky", "von_mises", "drucker_prager"),
 }
 _OPTIONS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fPIC", "-shared")
 _COMPILERS = ("c++", "g++", "clang++")
@@ -101,9 +104,10 @@ def _library(source: str, dtype: str, dimension: int) -> Library | None:
         handlers = {name: getattr(loaded, f"pgjax_{name}") for name in HANDLERS[source]}
     except (OSError, RuntimeError, AttributeError, subprocess.SubprocessError) as error:
         detail = getattr(error, "stderr", None) or str(error)
+        lines = [line for line in detail.splitlines() if "error" in line] or [detail]
         _warn(
             f"building or loading them with {found} in the folder PGJAX_CACHE_DIR failed: "
-            f"{detail.strip()[-500:]}"
+            f"{' '.join(lines)[:500]}"
         )
         return None
     # The key is part of the name: a program that JAX kept in its cache never meets a kernel other
@@ -132,8 +136,8 @@ def _key(found: str, options: tuple[str, ...], source: str) -> str:
     facts = (*options, version("jaxlib"), platform.machine(), platform.system(), _cpu())
     for fact in (made_by, *facts):
         digest.update(fact.encode() + b"\0")
-    for name in ("parallel.h", "xla.h", f"{source}.h", f"{source}.cc"):
-        digest.update((_HERE / name).read_bytes())
+    for file in (*sorted(_HERE.glob("*.h")), _HERE / f"{source}.cc"):
+        digest.update(file.read_bytes())
     return digest.hexdigest()
 
 
@@ -185,6 +189,16 @@ def result_type(like: ShapedArray, shape: tuple[int, ...]) -> ShapedArray:
     """The type of a result: that of an operand but for its shape, inside `shard_map` too."""
     spec = PartitionSpec(*(None,) * len(shape))
     return like.update(shape=shape, sharding=NamedSharding(like.sharding.mesh, spec))
+
+
+def varying(*operands: Array) -> tuple[Array, ...]:
+    """Inside `shard_map`, all operands of a primitive made to vary over the same mesh axes."""
+    own = [jax.typeof(a).manual_axis_type.varying for a in operands]
+    everywhere = frozenset[Any]().union(*own)
+    return tuple(
+        jax.lax.pcast(a, tuple(everywhere - axes), to="varying") if axes != everywhere else a
+        for a, axes in zip(operands, own, strict=True)
+    )
 
 
 def run(primitive: Primitive, *operands: Any, **static: Any) -> Any:

@@ -4,32 +4,12 @@
 // is a vector of the same entry of a whole group of matrices.
 #pragma once
 
-#include <cmath>
 #include <cstdint>
 #include <type_traits>
 
-#include "parallel.h"
+#include "blocks.h"
 
 namespace pgjax {
-
-constexpr int kVectorBytes = 64;
-
-template <class T>
-struct GroupOf {
-  typedef T type __attribute__((vector_size(kVectorBytes)));
-};
-template <class T>
-using Group = typename GroupOf<T>::type;
-template <class T>
-constexpr int kGroup = kVectorBytes / sizeof(T);  // matrices in a group
-
-template <class V>
-inline V root(V x) {
-  V r;
-  // One instruction: the compiler is told that errno is not looked at.
-  for (unsigned l = 0; l < sizeof(V) / sizeof(x[0]); ++l) r[l] = std::sqrt(x[l]);
-  return r;
-}
 
 // Rotates the basis in the plane (i, j) so that the entry `off` of the matrix vanishes.
 template <class V>
@@ -62,10 +42,13 @@ inline void put_larger_first(V& wi, V& wj, V qi[3], V qj[3]) {
   }
 }
 
+template <class V>
+constexpr int kSweeps = sizeof(V{}[0]) == sizeof(float) ? 4 : 6;
+
 // One group: the six entries in `a` (00, 11, 22, 01, 02, 12), eigenvalues and basis out, the
 // columns of which are the vectors.
 template <class V>
-inline void diagonalise(int sweeps, const V a[6], V w[3], V q[9]) {
+inline void diagonalise(const V a[6], V w[3], V q[9]) {
   const V zero = {}, one = zero + 1;
   V scale = zero;
   for (int i = 0; i < 6; ++i) {
@@ -76,7 +59,7 @@ inline void diagonalise(int sweeps, const V a[6], V w[3], V q[9]) {
   V a00 = a[0] / scale, a11 = a[1] / scale, a22 = a[2] / scale;
   V a01 = a[3] / scale, a02 = a[4] / scale, a12 = a[5] / scale;
   V q0[3] = {one, zero, zero}, q1[3] = {zero, one, zero}, q2[3] = {zero, zero, one};
-  for (int sweep = 0; sweep < sweeps; ++sweep) {
+  for (int sweep = 0; sweep < kSweeps<V>; ++sweep) {
     rotate(a00, a11, a01, a02, a12, q0, q1);
     rotate(a00, a22, a02, a01, a12, q0, q2);
     rotate(a11, a22, a12, a01, a02, q1, q2);
@@ -92,25 +75,11 @@ inline void diagonalise(int sweeps, const V a[6], V w[3], V q[9]) {
 template <class T>
 void eigenbasis(std::int64_t count, const T* A, T* w, T* Q, Pool& pool) {
   using V = Group<T>;
-  constexpr int kSweeps = std::is_same_v<T, float> ? 4 : 6;
-  constexpr int kLanes = kGroup<T>;
-  constexpr std::int64_t kChunk = 64;  // groups in a task
-  static constexpr int kEntry[6] = {0, 4, 8, 1, 2, 5};
-  const std::int64_t groups = (count + kLanes - 1) / kLanes;
-  pool.run((groups + kChunk - 1) / kChunk, [=](std::int64_t chunk) {
-    const std::int64_t last = std::min(groups, (chunk + 1) * kChunk);
-    for (std::int64_t group = chunk * kChunk; group < last; ++group) {
-      const std::int64_t first = group * kLanes;
-      const int size = int(std::min<std::int64_t>(kLanes, count - first));
-      V in[6] = {}, values[3], vectors[9];
-      for (int l = 0; l < size; ++l)
-        for (int e = 0; e < 6; ++e) in[e][l] = A[(first + l) * 9 + kEntry[e]];
-      diagonalise(kSweeps, in, values, vectors);
-      for (int l = 0; l < size; ++l) {
-        for (int i = 0; i < 3; ++i) w[(first + l) * 3 + i] = values[i][l];
-        for (int e = 0; e < 9; ++e) Q[(first + l) * 9 + e] = vectors[e][l];
-      }
-    }
+  const Column<const T> ins[] = {{A, 9}};
+  const Column<T> outs[] = {{w, 3}, {Q, 9}};
+  for_each_block<T, 9, 12>(count, ins, outs, pool, [](const V* a, V* made) {
+    const V symmetric[6] = {a[0], a[4], a[8], a[1], a[2], a[5]};
+    diagonalise(symmetric, made, made + 3);
   });
 }
 

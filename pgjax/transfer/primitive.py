@@ -188,14 +188,7 @@ def _batch(primitive: Primitive, operands: Arrays, axes: Any, **static: Any) -> 
 
 
 def _bind(primitive: Primitive, *operands: Array, **static: Any) -> list[Array]:
-    """Bind; inside `shard_map` all operands are first made to vary over the same mesh axes."""
-    varying = [jax.typeof(a).manual_axis_type.varying for a in operands]
-    everywhere = frozenset[Any]().union(*varying)
-    operands = tuple(
-        jax.lax.pcast(a, tuple(everywhere - own), to="varying") if own != everywhere else a
-        for a, own in zip(operands, varying, strict=True)
-    )
-    return primitive.bind(*operands, **static)
+    return primitive.bind(*native.varying(*operands), **static)
 
 
 scatter_p = _define("scatter", _scatter, _nodes_shape, "xaBB a")

@@ -7,6 +7,7 @@
 #include <thread>
 
 #include "eigen.h"
+#include "laws.h"
 #include "transfer.h"
 
 using namespace pgjax;
@@ -173,10 +174,46 @@ bool check_eigen() {
   return true;
 }
 
+// A law or a return mapping of three numbers besides H: finite, and the same with more threads.
+template <class T, class F>
+bool check_law(const F& one) {
+  for (std::int64_t count : {0, 1, 129, 5000}) {
+    std::mt19937 random(9);
+    std::normal_distribution<T> normal;
+    Numbers<T> H(count * 9), more(count * 3, T(0.3)), out(count * 12), again(count * 12);
+    for (T& v : H) v = normal(random) / 3;
+    const auto run = [&](Numbers<T>& to, Pool pool) {
+      const Column<const T> ins[] = {{H.data(), 9}, {more.data(), 3}};
+      const Column<T> outs[] = {{to.data(), 12}};
+      for_each_block<T, 12, 12>(count, ins, outs, pool, [&](const Group<T>* a, Group<T>* made) {
+        for (int e = 0; e < 12; ++e) made[e] = Group<T>{};
+        one(a, made);
+      });
+    };
+    Threads others(2);
+    run(out, Pool()), run(again, others.pool());
+    if (out != again)
+      return std::printf("a law depends on the number of threads\n"), false;
+    for (T v : out)
+      if (!std::isfinite(v)) return std::printf("a law is not finite\n"), false;
+  }
+  return true;
+}
+
+template <class T>
+bool check_laws() {
+  using V = Group<T>;
+  return check_law<T>(neo_hookean<V>) && check_law<T>(fixed_corotated<V>) &&
+         check_law<T>(stvk_hencky<V>) && check_law<T>(von_mises<V>) &&
+         check_law<T>(drucker_prager<V>);
+}
+
 }  // namespace
 
 int main() {
-  const bool good = check_eigen<float>() && check_eigen<double>() && check_dimension<float, 2>() && check_dimension<float, 3>() &&
+  const bool good = check_eigen<float>() && check_eigen<double>() && check_laws<float>() &&
+                    check_laws<double>() && check_dimension<float, 2>() &&
+                    check_dimension<float, 3>() &&
                     check_dimension<double, 2>() && check_dimension<double, 3>();
   std::puts(good ? "equal" : "FAILED");
   return good ? 0 : 1;
