@@ -69,6 +69,7 @@ class AbstractHenckyPlasticity(AbstractPlasticity):
     ) -> tuple[Matrix3, Array, Array | None]:
         """From the trial Hencky strain: the new one, whether it changed, and the new history."""
 
+    @final
     def return_map(
         self, H: Matrix3, history: Array | None, elasticity: AbstractElasticity, dt: Scalar
     ) -> tuple[Matrix3, Array | None]:
