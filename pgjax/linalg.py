@@ -190,7 +190,12 @@ def svd(F: Matrix3) -> tuple[Matrix3, Vector3, Matrix3]:
         `U (3, 3)`, `σ (3,)`, `V (3, 3)`; reconstruction error about 3e-7 (float32) or
         1e-15 (float64) of the largest singular value.
     """
-    F = jax.lax.stop_gradient(F)
+    U, sigma, V = _svd_call(jax.lax.stop_gradient(F))
+    return U, sigma, V
+
+
+def _svd(F: Matrix3) -> tuple[Matrix3, Vector3, Matrix3]:
+    """The same in plain JAX."""
     scale = jnp.max(jnp.abs(F))
     scale = jnp.where(scale > 0, scale, 1)
     A = F / scale
@@ -211,6 +216,9 @@ def svd(F: Matrix3) -> tuple[Matrix3, Vector3, Matrix3]:
     sigma = jnp.stack([jnp.sum(u1 * g1), jnp.sum(u2 * g2), jnp.sum(u3 * g3)]) * scale
     V = jnp.stack([jnp.stack(column) for column in v], axis=1)
     return jnp.stack([u1, u2, u3], axis=1), sigma, V
+
+
+_svd_call = per_particle("svd", "eigen", _svd, [2])
 
 
 @jax.custom_jvp

@@ -53,6 +53,34 @@ def test_eigenbasis_of_both(monkeypatch):
     assert jnp.all(jnp.isnan(jax.jit(linalg.eigenbasis)(jnp.full((3, 3), jnp.nan))[0]))
 
 
+@needs_compiler
+def test_svd_of_both(monkeypatch):
+    """Native and plain: any rank and sign, equal values, extreme sizes; U and V are rotations."""
+    monkeypatch.setenv("PGJAX_NATIVE", "1")
+    jax.clear_caches()
+    dtype = jnp.zeros(()).dtype
+    rng = np.random.default_rng(1)
+    F = rng.normal(size=(200, 3, 3))
+    F[:4] = np.eye(3), np.zeros((3, 3)), np.diag([1, 1, -1]), np.outer([1, 2, 3], [3, 0, 1])
+    F[4:8, :, 2] = 0
+    F[8:12] *= 1e-18
+    F[12:16] *= 1e18
+    F = jnp.asarray(F, dtype)
+    compiled = jax.jit(jax.vmap(linalg.svd))
+    assert "pgjax_svd_" in compiled.lower(F).as_text()
+    U, sigma, V = compiled(F)
+    plain = jax.jit(jax.vmap(linalg._svd))(F)[1]
+    size, eps = jnp.max(jnp.abs(F), axis=(-1, -2)), float(jnp.finfo(dtype).eps)
+    assert jnp.all(jnp.abs(sigma - plain) <= 16 * eps * size[:, None])
+    back = jnp.einsum("pij,pj,pkj->pik", U, sigma, V)
+    assert jnp.all(jnp.abs(back - F) <= 32 * eps * size[:, None, None])
+    for R in (U, V):
+        np.testing.assert_allclose(
+            R @ jnp.swapaxes(R, 1, 2), np.tile(np.eye(3), (200, 1, 1)), atol=32 * eps
+        )
+        np.testing.assert_allclose(jnp.linalg.det(R), 1, atol=32 * eps)
+
+
 def test_without_jit():
     """`jax.disable_jit` is how users look into a step."""
     with jax.disable_jit():
@@ -63,7 +91,7 @@ def test_without_jit():
 @needs_compiler
 def test_a_library_that_lacks_a_kernel_is_not_used(monkeypatch):
     monkeypatch.setenv("PGJAX_NATIVE", "1")
-    monkeypatch.setitem(native.HANDLERS, "eigen", ("eigenbasis", "missing"))
+    monkeypatch.setitem(native.HANDLERS, "eigen", ("eigenbasis", "svd", "missing"))
     native._warn.cache_clear()
     with pytest.warns(native.NativeWarning, match="pgjax_missing"):
         assert native._library.__wrapped__("eigen", "float32", 3) is None

@@ -182,8 +182,9 @@ class Box(AbstractGridCondition):
 
     def _walls(self, axis: int, x: Vectors, v: Vectors) -> Vectors:
         """The two walls across one direction; no node is behind both."""
-        low = x[axis] - self.lower[axis] <= _tolerance(x, self.lower[:, None])
-        high = self.upper[axis] - x[axis] <= _tolerance(x, self.upper[:, None])
+        lower, upper = self.lower[:, None], self.upper[:, None]
+        low = (x - lower)[axis] <= _tolerance(x, lower)
+        high = (upper - x)[axis] <= _tolerance(x, upper)
         sign = jnp.where(high, -1, 1).astype(v.dtype)
         inward = jnp.stack([sign if i == axis else 0 * sign for i in range(x.shape[0])])
         touched = jax.vmap(self.contact, in_axes=(1, 1), out_axes=1)(v, inward)

@@ -32,7 +32,7 @@ from pgjax._types import Array
 # What each source holds.
 HANDLERS = {
     "transfer": ("scatter", "scatter_tangent", "gather", "gather_tangent", "pull"),
-    "eigen": ("eigenbasis",),
+    "eigen": ("eigenbasis", "svd"),
     "laws": ("neo_hookean", "fixed_corotated", "stvk_hencky", "von_mises", "drucker_prager"),
 }
 _OPTIONS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fPIC", "-shared")

@@ -76,15 +76,15 @@ class Memory(NamedTuple):
 def needed_memory(scene: Scene, state: State) -> Memory:
     """What the simulation takes, without drawing and without derivatives.
 
-    The state is there three times: before the frame, after it, and between two steps. Native
-    transfers hold four numbers at each node, before and after the forces, and the payload of each
-    particle. In plain JAX a node has mass, momentum and one more number, and a particle its window
-    of nodes and three rows of weights for each node of a direction, too.
+    The state is there three times: before the frame, after it, and between two steps. A node has
+    mass and momentum, which the sweep takes, and twice the velocity it returns. Native transfers
+    hold the payload of each particle; in plain JAX a particle has its window of nodes and three
+    rows of weights for each node of a direction.
     """
     d, k, number = scene.grid.dimension, scene.spline.width, state.dtype.itemsize
-    particle, node = d + 1 + 2 * d * d + d, 8
+    particle, node = d + 1 + 2 * d * d + d, 2 + 3 * d
     if not native.available():
-        particle, node = k**d * (d + 1) + 3 * k * d + (d + 1) * (1 + 2 * d), d + 2
+        particle = k**d * (d + 1) + 3 * k * d + (d + 1) * (1 + 2 * d)
     return Memory(
         scene=_bytes(scene),
         state=3 * _bytes(state),

@@ -143,12 +143,12 @@ bool check_dimension() {
          check<T, D, 3, false>(700, 5) && check<T, D, 4, false>(1, 1) && check<T, D, 3, true>(0, 1);
 }
 
-// Q diag(w) Q^T is the matrix again, in groups that are full and in the rest of one.
+// Q diag(w) Q^T and U diag(sigma) V^T are the matrix again, in groups that are full and in the rest of one.
 template <class T>
 bool check_eigen(std::int64_t count) {
   std::mt19937 random(5);
   std::normal_distribution<T> normal;
-  Numbers<T> A(count * 9), w(count * 3), Q(count * 9);
+  Numbers<T> A(count * 9), w(count * 3), Q(count * 9), U(count * 9), sigma(count * 3), V(count * 9);
   for (std::int64_t p = 0; p < count; ++p)
     for (int i = 0; i < 3; ++i)
       for (int j = i; j < 3; ++j)
@@ -156,13 +156,18 @@ bool check_eigen(std::int64_t count) {
   Threads more(2);
   Pool pool = more.pool();
   eigenbasis<T>(count, A.data(), w.data(), Q.data(), pool);
+  svd<T>(count, A.data(), U.data(), sigma.data(), V.data(), pool);
   for (std::int64_t p = 0; p < count; ++p)
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j) {
-        T sum = 0;
-        for (int k = 0; k < 3; ++k) sum += Q[9 * p + 3 * i + k] * w[3 * p + k] * Q[9 * p + 3 * j + k];
-        if (!(std::fabs(sum - A[9 * p + 3 * i + j]) < 20 * std::numeric_limits<T>::epsilon() * 4))
-          return std::printf("eigenbasis of matrix %d is wrong\n", int(p)), false;
+        T sum = 0, product = 0;
+        for (int k = 0; k < 3; ++k) {
+          sum += Q[9 * p + 3 * i + k] * w[3 * p + k] * Q[9 * p + 3 * j + k];
+          product += U[9 * p + 3 * i + k] * sigma[3 * p + k] * V[9 * p + 3 * j + k];
+        }
+        const T expected = A[9 * p + 3 * i + j], bound = 80 * std::numeric_limits<T>::epsilon();
+        if (!(std::fabs(sum - expected) < bound && std::fabs(product - expected) < bound))
+          return std::printf("decomposition of matrix %d is wrong\n", int(p)), false;
       }
   return true;
 }
