@@ -26,7 +26,7 @@ from pgjax._types import (
 )
 from pgjax.boundary.contact import AbstractContact, Separating, Sticky
 from pgjax.boundary.motion import AbstractMotion
-from pgjax.boundary.nodes import Region
+from pgjax.boundary.nodes import Region, change_if
 from pgjax.boundary.shapes import AbstractShape, normal
 from pgjax.boundary.window import require_window, within
 
@@ -117,7 +117,7 @@ class Collider(AbstractGridCondition):
             new = jax.vmap(self._touched, in_axes=(1, 1, None), out_axes=1)(x, v, t)
             return jnp.where(inside, new, v)
 
-        return jax.lax.cond(jnp.any(inside), touched, lambda v: v, v)
+        return change_if(jnp.any(inside), touched, v)
 
     def _holds(self, x: Vector, t: Scalar) -> Bool[Array, ""]:
         at_rest = x if self.motion is None else self.motion.at(t).to_rest(x)
@@ -177,7 +177,7 @@ class Box(AbstractGridCondition):
             low = region.low[axis] <= self.lower[axis]
             high = region.high[axis] >= self.upper[axis]
             walls = functools.partial(self._walls, axis, x)
-            v = jax.lax.cond(low | high, walls, lambda v: v, v)
+            v = change_if(low | high, walls, v)
         return v
 
     def _walls(self, axis: int, x: Vectors, v: Vectors) -> Vectors:

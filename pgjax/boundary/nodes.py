@@ -28,6 +28,16 @@ class Region(NamedTuple):
         return jnp.all((x >= self.low[:, None]) & (x <= self.high[:, None]), axis=0)
 
 
+def branches() -> bool:
+    """Whether work is skipped by a branch: on an accelerator a branch waits for the host."""
+    return jax.default_backend() == "cpu"
+
+
+def change_if(needed: Bool[Array, ""], change: Callable[[Vectors], Vectors], v: Vectors) -> Vectors:
+    """`change(v)`, which leaves v as it is unless `needed`; then it is skipped where that pays."""
+    return jax.lax.cond(needed, change, lambda v: v, v) if branches() else change(v)
+
+
 def sweep(
     grid: Grid,
     one: Callable[[Vectors, Float[Array, "c n"], Region], Vectors],
@@ -47,7 +57,7 @@ def sweep(
     """
     d = grid.dimension
     first, *others = (a + start for a, start in zip(grid.axes(), grid.origin, strict=True))
-    layers = _layers(grid.node_shape)
+    layers = _layers(grid.node_shape) if branches() else grid.node_shape[0]
 
     def occupied(x0: Float[Array, " k"], values: Array, region: Region) -> Array:
         x = jnp.stack(jnp.meshgrid(x0, *others, indexing="ij")).reshape(d, -1)
@@ -60,6 +70,8 @@ def sweep(
 
     def slab(args: tuple[Float[Array, " k"], Array]) -> Array:
         x0, values = args
+        if layers == grid.node_shape[0]:
+            return occupied(x0, values, region)
         low, high = region.low.at[0].max(x0[0]), region.high.at[0].min(x0[-1])
         here = Region(low, high)
         return jax.lax.cond(low[0] <= high[0], occupied, empty, x0, values, here)
