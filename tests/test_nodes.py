@@ -1,9 +1,13 @@
 """Conditions in slabs, where there is mass: the same as everywhere on the grid."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
 import pgjax
 from pgjax import boundary, models, sampling
@@ -74,6 +78,22 @@ def test_a_batch_of_worlds_in_different_places():
     together = jax.jit(jax.vmap(one))(moved)
     alone = jnp.stack([jax.jit(one)(x) for x in moved])
     np.testing.assert_allclose(together, alone, rtol=0, atol=1e-13)
+
+
+def test_inside_shard_map():
+    """A step of each member of a sharded batch, and the derivative through it."""
+    scene, state = scene_and_state(3)
+    mesh = Mesh(np.array(jax.devices()[:1]), ("b",))
+    one = jax.vmap(lambda v: after(scene, state, v))
+    sharded = jax.shard_map(one, mesh=mesh, in_specs=P("b"), out_specs=P("b"))
+
+    def loss(run, v):
+        return jnp.sum(run(v[None]) ** 2)
+
+    value, bar = jax.jit(jax.value_and_grad(functools.partial(loss, sharded)))(state.v)
+    expected, bar_expected = jax.jit(jax.value_and_grad(functools.partial(loss, one)))(state.v)
+    np.testing.assert_allclose(value, expected, rtol=1e-13)
+    np.testing.assert_allclose(bar, bar_expected, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("shape", [(69, 69, 69), (69, 30), (2053, 3), (64, 5, 5)])

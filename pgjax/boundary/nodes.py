@@ -29,8 +29,12 @@ class Region(NamedTuple):
 
 
 def branches() -> bool:
-    """Whether work is skipped by a branch: on an accelerator a branch waits for the host."""
-    return jax.default_backend() == "cpu"
+    """Whether work is skipped by a branch.
+
+    On an accelerator a branch waits for the host; inside `shard_map` its two results would have
+    to vary over the same mesh axes.
+    """
+    return jax.default_backend() == "cpu" and not jax.sharding.get_abstract_mesh().manual_axes
 
 
 def change_if(needed: Bool[Array, ""], change: Callable[[Vectors], Vectors], v: Vectors) -> Vectors:
@@ -57,25 +61,25 @@ def sweep(
     """
     d = grid.dimension
     first, *others = (a + start for a, start in zip(grid.axes(), grid.origin, strict=True))
-    layers = _layers(grid.node_shape) if branches() else grid.node_shape[0]
 
-    def occupied(x0: Float[Array, " k"], values: Array, region: Region) -> Array:
+    def everything(x0: Float[Array, " k"], values: Array, region: Region) -> Array:
         x = jnp.stack(jnp.meshgrid(x0, *others, indexing="ij")).reshape(d, -1)
         new = one(x, values.reshape(-1, values.shape[-1]).T, region)
         return new.T.reshape(*values.shape[:-1], d)
 
-    def empty(x0: Float[Array, " k"], values: Array, region: Region) -> Array:
+    def nothing(x0: Float[Array, " k"], values: Array, region: Region) -> Array:
         del x0, region
         return jnp.zeros((*values.shape[:-1], d), values.dtype)
 
     def slab(args: tuple[Float[Array, " k"], Array]) -> Array:
         x0, values = args
-        if layers == grid.node_shape[0]:
-            return occupied(x0, values, region)
         low, high = region.low.at[0].max(x0[0]), region.high.at[0].min(x0[-1])
         here = Region(low, high)
-        return jax.lax.cond(low[0] <= high[0], occupied, empty, x0, values, here)
+        return jax.lax.cond(low[0] <= high[0], everything, nothing, x0, values, here)
 
+    layers = _layers(grid.node_shape)
+    if layers == grid.node_shape[0] or not branches():
+        return jax.checkpoint(everything)(first, values, region)
     # Slabs go in and out as a list: carried along and updated in place, they would be 4 ns
     # per particle faster, and their derivative would copy the whole grid for each of them.
     slabs = tuple(a.reshape(-1, layers, *a.shape[1:]) for a in (first, values))
