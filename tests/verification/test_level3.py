@@ -77,10 +77,11 @@ def test_v20_momentum_in_a_periodic_domain(measure):
 @pytest.mark.parametrize("name", SCHEMES)
 def test_v20_momenta_of_a_long_run(measure, name, dtype, tolerance):
     P, L = drift(*welded(2, name), 100_000, dtype)
-    if name.startswith("cubic") and dtype == jnp.float32:
-        # 1/6 and 1/3 are not binary fractions: each step rounds the moments of the weights the
-        # same way, a few 1e-9 of L.
-        tolerance = 5e-4
+    if dtype == jnp.float32:
+        # The drift of L is rounding: six starts that differ by 1e-4 end between 0.7e-4 and 1.3e-4
+        # with the quadratic spline. With the cubic one each step rounds the moments of the weights
+        # the same way, a few 1e-9 of L, as 1/6 and 1/3 are not binary fractions.
+        tolerance = 5e-4 if name.startswith("cubic") else 2e-4
     case = f"{name}, 2-D, 1e5 steps, {dtype.__name__}"
     measure("V20", f"P, {case}", P, below=tolerance)
     measure("V20", f"L with its affine part, {case}", L, below=tolerance)
