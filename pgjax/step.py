@@ -153,6 +153,7 @@ def _forces_and_boundaries(
     kept = jnp.exp(-scene.grid_damping * dt)
 
     def velocity(x: Vectors, momentum_and_mass: Float[Array, "c n"], region: Region) -> Vectors:
+        """Of n nodes, components first."""
         momentum, mass = momentum_and_mass[:-1], momentum_and_mass[-1]
         v = safe_divide(momentum, jnp.broadcast_to(mass, momentum.shape))
         v = (v + (dt * scene.gravity)[:, None]) * kept

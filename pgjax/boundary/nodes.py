@@ -80,8 +80,8 @@ def sweep(
     layers = _layers(grid.node_shape)
     if layers == grid.node_shape[0] or not branches():
         return jax.checkpoint(everything)(first, values, region)
-    # Slabs go in and out as a list: carried along and updated in place, they would be 4 ns
-    # per particle faster, and their derivative would copy the whole grid for each of them.
+    # Slabs go in and out as a list: the derivative of a grid that is carried along and updated in
+    # place copies the whole of it for each slab.
     slabs = tuple(a.reshape(-1, layers, *a.shape[1:]) for a in (first, values))
     return jax.lax.map(jax.checkpoint(slab, prevent_cse=False), slabs).reshape(*grid.node_shape, d)
 

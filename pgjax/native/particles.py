@@ -41,6 +41,7 @@ def per_particle(
         return one(*operands)
 
     def on_cpu(*operands: Array) -> Arrays:
+        """The native kernel, or the plain function where there is none."""
         library = native.library(source, jnp.dtype(operands[0].dtype).name)
         if library is None:
             return over_all(*operands)
