@@ -44,6 +44,18 @@ inline void put_larger_first(V& wi, V& wj, V qi[3], V qj[3]) {
   }
 }
 
+// The largest magnitude of N entries, or 1 if all are 0.
+template <int N, class V>
+inline V largest(const V* a) {
+  const V zero = {}, one = zero + 1;
+  V scale = zero;
+  for (int i = 0; i < N; ++i) {
+    const V size = a[i] < 0 ? -a[i] : a[i];
+    scale = size > scale ? size : scale;
+  }
+  return scale > 0 ? scale : one;
+}
+
 template <class V>
 constexpr int kSweeps = sizeof(V{}[0]) == sizeof(float) ? 4 : 6;
 
@@ -52,12 +64,7 @@ constexpr int kSweeps = sizeof(V{}[0]) == sizeof(float) ? 4 : 6;
 template <class V>
 inline void diagonalise(const V a[6], V w[3], V q[9]) {
   const V zero = {}, one = zero + 1;
-  V scale = zero;
-  for (int i = 0; i < 6; ++i) {
-    const V size = a[i] < 0 ? -a[i] : a[i];
-    scale = size > scale ? size : scale;
-  }
-  scale = scale > 0 ? scale : one;
+  const V scale = largest<6>(a);
   V a00 = a[0] / scale, a11 = a[1] / scale, a22 = a[2] / scale;
   V a01 = a[3] / scale, a02 = a[4] / scale, a12 = a[5] / scale;
   V q0[3] = {one, zero, zero}, q1[3] = {zero, one, zero}, q2[3] = {zero, zero, one};
@@ -122,12 +129,7 @@ template <class V>
 inline void decompose(const V f[9], V u_out[9], V sigma[3], V v_out[9]) {
   using T = std::decay_t<decltype(V{}[0])>;
   const V zero = {}, one = zero + 1;
-  V scale = zero;
-  for (int i = 0; i < 9; ++i) {
-    const V size = f[i] < 0 ? -f[i] : f[i];
-    scale = size > scale ? size : scale;
-  }
-  scale = scale > 0 ? scale : one;
+  const V scale = largest<9>(f);
   V g[3][3], v[3][3];  // columns
   for (int j = 0; j < 3; ++j)
     for (int i = 0; i < 3; ++i) g[j][i] = f[3 * i + j] / scale, v[j][i] = i == j ? one : zero;
