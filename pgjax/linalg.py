@@ -91,7 +91,7 @@ def _eigenbasis(A: Matrix3) -> tuple[Vector3, Matrix3]:
     return jnp.stack(w) * scale, jnp.stack([jnp.stack(row) for row in q])
 
 
-_eigenbasis_call = per_particle("eigenbasis", "eigen", _eigenbasis, [2])
+_eigenbasis_call = per_particle("eigenbasis", "eigen", _eigenbasis, 2)
 
 
 @jax.custom_jvp
@@ -218,7 +218,7 @@ def _svd(F: Matrix3) -> tuple[Matrix3, Vector3, Matrix3]:
     return jnp.stack([u1, u2, u3], axis=1), sigma, V
 
 
-_svd_call = per_particle("svd", "eigen", _svd, [2])
+_svd_call = per_particle("svd", "eigen", _svd, 2)
 
 
 @jax.custom_jvp

@@ -33,7 +33,8 @@ def note_frame(scene: Scene, state: State, dt: Scalar) -> State:
     }
     if state.dtype == jnp.float32:
         events[Condition.F32_RESOLUTION] = state.alive & _unresolved(scene, state)
-    return eqx.tree_at(lambda s: s.status, state, state.status.note(events, state.step))
+    counts = {condition: jnp.sum(a, dtype=jnp.int32) for condition, a in events.items()}
+    return eqx.tree_at(lambda s: s.status, state, state.status.note(counts, state.step))
 
 
 def _elliptic(scene: Scene, state: State) -> Bool[Array, " p"]:

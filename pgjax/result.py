@@ -85,11 +85,10 @@ class Status(eqx.Module):
         k = len(Condition)
         return Status(jnp.full((k,), NEVER, jnp.int32), jnp.zeros((k,), jnp.int32))
 
-    def note(self, events: dict[Condition, Bool[Array, "..."]], step: Int[Array, ""]) -> "Status":
-        """Count the events of one step."""
+    def note(self, events: dict[Condition, Int[Array, ""]], step: Int[Array, ""]) -> "Status":
+        """Count the events of one step: how many there were of each kind."""
         first, count = self.first, self.count
-        for condition, where in events.items():
-            n = jnp.sum(where, dtype=jnp.int32)
+        for condition, n in events.items():
             first = first.at[condition].min(jnp.where(n > 0, step, NEVER))
             # Saturating: a count never wraps round.
             total = count[condition]

@@ -11,12 +11,26 @@ import numpy as np
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Scalar
 from pgjax.boundary import AbstractGridCondition, Particles, Region, sweep
+from pgjax.exchange import (
+    EVENTS,
+    Receiver,
+    Sender,
+    embed,
+    is_finite,
+    receive,
+    receive_natively,
+    send,
+    send_natively,
+    velocities,
+    where,
+)
 from pgjax.grid import Grid
-from pgjax.models.material import cast, particle_axes
+from pgjax.models.law import AbstractElasticity, Response
+from pgjax.models.material import Material, cast, particle_axes
 from pgjax.result import Condition
 from pgjax.scene import Scene
 from pgjax.state import State
-from pgjax.transfer import Payload, Stencil, gather, scatter, stencil
+from pgjax.transfer import MLS, SplineGradient, Stencil, stencil
 
 Vectors = Float[Array, "d n"]
 
@@ -40,11 +54,10 @@ def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
     t = state.step.astype(state.dtype) * dt
 
     held, state = _impose(scene, state, t, dt)
-    state, at, tau = _stress(scene, state, t)
-    momentum_and_mass = _particles_to_grid(scene, state, at, tau, dt)
+    at, inside = stencil(scene.grid, scene.spline, state.position)
+    state, finite, momentum_and_mass = _particles_to_grid(scene, state, at, inside, t, dt)
     grid_v = _forces_and_boundaries(scene, at, momentum_and_mass, t, dt)
-    v, C, L = _grid_to_particles(scene, at, grid_v)
-    return _update(scene, state, held, v, C, L, dt)
+    return _grid_to_particles(scene, state, at, finite, held, grid_v, dt)
 
 
 def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Array, " p"], State]:
@@ -57,114 +70,113 @@ def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Arr
         acceleration = jax.vmap(scene.body_force, in_axes=(0, None))(scene.X0, t)
         v = v + dt * acceleration.astype(state.dtype)
     mass = jnp.where(state.alive, scene.masses, 0)
-    x = _where(state.alive & _finite(state.position), state.x, 0)
+    x = where(state.alive & is_finite(state.position), state.x, 0)
     particles = Particles(x, v, state.C, mass, jnp.zeros_like(state.alive))
     for condition in scene.particle_conditions:
         before, particles = particles, condition(particles, t, dt)
         # What is led already stays so, whatever comes later in the list.
         particles = particles._replace(
-            v=_where(before.held, before.v, particles.v),
-            C=_where(before.held, before.C, particles.C),
+            v=where(before.held, before.v, particles.v),
+            C=where(before.held, before.C, particles.C),
             held=before.held | particles.held,
         )
     v, C = particles.v, particles.C
     return particles.held, eqx.tree_at(lambda s: (s.v, s.C), state, (v, C))
 
 
-def _stress(scene: Scene, state: State, t: Scalar) -> tuple[State, Stencil, Float[Array, "p 3 3"]]:
-    """Kirchhoff stress of every particle; those that cannot go on are masked here."""
-    finite = _finite(state.position) & _finite(state.v) & _finite(state.C) & _finite(state.He)
-    if state.H is not None:
-        finite = finite & _finite(state.H)
-    # Harmless values where a particle is dead, so that neither it nor its derivative spreads.
-    state = _without_nan(state, finite)
-    sound = state.alive & finite
-    at, inside = stencil(scene.grid, scene.spline, _where(sound, state.position, 0))
-    sound = sound & inside
-    He, C = _where(sound, state.He, 0), _where(sound, state.C, 0)
-    total = He if state.H is None else _where(sound, state.H, 0)
+def _particles_to_grid(
+    scene: Scene, state: State, at: Stencil, inside: Bool[Array, " p"], t: Scalar, dt: Scalar
+) -> tuple[State, Bool[Array, " p"], Float[Array, "*grid c"]]:
+    """Momentum and mass of the nodes, the internal forces already in the momentum.
 
-    tau, inverted, clamped = [], [], []
-    for material, part, history in zip(scene.materials, scene.slices, state.history, strict=True):
+    Returns:
+        The state, in which particles that cannot go on are masked; which are finite; the nodes.
+    """
+    particles = Sender(
+        alive=state.alive,
+        inside=inside,
+        xi=at.xi,
+        position=state.position,
+        mass=scene.masses,
+        volume=scene.volumes,
+        v=state.v,
+        C=state.C,
+        He=state.He,
+        H=state.He[:, :0] if state.H is None else state.H,
+    )
+    numbers = jnp.stack([dt, scene.grid.h, scene.D])
+    shape = {"degree": scene.spline.degree, "nodes": scene.grid.padded_shape}
+    native = _native_law(scene)
+    if native is not None:
+        name, law = native
+        sent = send_natively(particles, name, (law.mu, law.lam), scene.scheme, numbers, **shape)
+    else:
+        respond = functools.partial(_respond, scene, state.history, t)
+        sent = send(particles, respond, scene.scheme, numbers, **shape)
+    events: dict[Condition, Array] = dict(zip(EVENTS, sent.events, strict=True))
+    status = state.status.note(events, state.step)
+    state = eqx.tree_at(lambda s: (s.alive, s.status), state, (sent.alive, status))
+    return state, sent.finite, scene.grid.fold(sent.nodes)
 
-        def law(material, H, total, L, history):
-            return material.response(H, total, L, history, t)
+
+def _native_law(scene: Scene) -> tuple[str, AbstractElasticity] | None:
+    """The law a native kernel of the whole stage knows, where the scene has no other."""
+    material, *others = scene.materials
+    law = material.elasticity
+    name = law.kernel()
+    if others or material.active is not None or name is None:
+        return None
+    if not isinstance(scene.scheme, MLS | SplineGradient):
+        return None
+    assert isinstance(law, AbstractElasticity)
+    return name, law
+
+
+def _respond(
+    scene: Scene,
+    histories: tuple[Any, ...],
+    t: Scalar,
+    He: Float[Array, "p 3 3"],
+    H: Float[Array, "p 3 3"],
+    C: Float[Array, "p d d"],
+) -> Response:
+    """Each material's response on its own slice."""
+    parts = []
+    for material, part, history in zip(scene.materials, scene.slices, histories, strict=True):
+
+        def law(material, He, H, L, history):
+            return material.response(He, H, L, history, t)
 
         axes = (particle_axes(material, part.stop - part.start), 0, 0, 0, 0)
         one = jax.vmap(law, in_axes=axes)
-        results = one(material, He[part], total[part], _embed(C[part]), history)
-        for values, result in zip((tau, inverted, clamped), results, strict=True):
-            values.append(result)
-    tau, inverted, clamped = (jnp.concatenate(parts) for parts in (tau, inverted, clamped))
-    tau_finite = _finite(tau)
-    tau = _where(sound & tau_finite, tau, 0)
-    alive = sound & tau_finite
-    status = state.status.note(
-        {
-            Condition.NONFINITE: state.alive & ~(finite & (tau_finite | ~inside)),
-            Condition.OUT_OF_DOMAIN: state.alive & finite & ~inside,
-            Condition.INVERTED: alive & inverted,
-            Condition.CLAMPED: alive & clamped,
-        },
-        state.step,
-    )
-    state = eqx.tree_at(lambda s: (s.alive, s.status), state, (alive, status))
-    return state, at, tau
-
-
-def _without_nan(state: State, finite: Bool[Array, " p"]) -> State:
-    """Rest values for what is not finite; only the position stays as it is, to be seen."""
-
-    def fields(s: State) -> tuple[Any, ...]:
-        return tuple(a for a in (s.v, s.C, s.He, s.H) if a is not None)
-
-    return eqx.tree_at(fields, state, tuple(_where(finite, a, 0) for a in fields(state)))
-
-
-def _particles_to_grid(
-    scene: Scene,
-    state: State,
-    at: Stencil,
-    tau: Float[Array, "p 3 3"],
-    dt: Scalar,
-) -> Float[Array, "*grid c"]:
-    """Momentum and mass of the nodes, the internal forces already in the momentum.
-
-    `m_i = Σ w m_p`, `m_i v_i = Σ w m_p (v_p + C_p (x_i − x_p)) − Δt Σ V⁰ τ ∇w` (eqs. 1–2).
-    """
-    d = scene.grid.dimension
-    mass = jnp.where(state.alive, scene.masses, 0)[:, None]
-    v, C = _where(state.alive, state.v, 0), _where(state.alive, state.C, 0)
-    flux = -dt * scene.volumes[:, None, None] * tau[:, :d, :d]
-    to_B, to_S = scene.scheme.split(flux, scene.D)
-    B = mass[:, :, None] * C
-    B = B if to_B is None else B + to_B
-    payload = Payload(jnp.concatenate([mass * v, mass], axis=1), B, to_S)
-    return scatter(scene.grid, at, payload)
+        parts.append(one(material, He[part], H[part], embed(C[part]), history))
+    return Response(*(jnp.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 def _forces_and_boundaries(
     scene: Scene, at: Stencil, momentum_and_mass: Float[Array, "*grid c"], t: Scalar, dt: Scalar
-) -> Float[Array, "*grid d"]:
-    """Velocity of the nodes: gravity, damping `exp(−γ Δt)`, then each condition in order.
+) -> Float[Array, "*grid c"]:
+    """Velocity of the nodes, and their mass: gravity, damping, then each condition in order.
 
-    Empty nodes stay at rest.
+    Damping is `exp(−γ Δt)`. Empty nodes stay at rest.
     """
-    kept = jnp.exp(-scene.grid_damping * dt)
+    kept, gained = jnp.exp(-scene.grid_damping * dt), dt * scene.gravity
+    if not scene.boundaries:
+        return velocities(momentum_and_mass, kept, gained)
 
-    def velocity(x: Vectors, momentum_and_mass: Float[Array, "c n"], region: Region) -> Vectors:
+    def constrained(x: Vectors, momentum_and_mass: Float[Array, "c n"], region: Region) -> Array:
         """Of n nodes, components first."""
-        momentum, mass = momentum_and_mass[:-1], momentum_and_mass[-1]
+        momentum, mass = momentum_and_mass[:-1], momentum_and_mass[-1:]
         v = safe_divide(momentum, jnp.broadcast_to(mass, momentum.shape))
-        v = (v + (dt * scene.gravity)[:, None]) * kept
+        v = kept * (v + gained[:, None])
         for condition in scene.boundaries:
             if isinstance(condition, AbstractGridCondition):
                 v = condition.on_nodes(x, v, t, region)
             else:
                 v = jax.vmap(condition, in_axes=(1, 1, None), out_axes=1)(x, v, t)
-        return jnp.where(mass > 0, v, 0)
+        return jnp.concatenate([jnp.where(mass > 0, v, 0), mass])
 
-    return sweep(scene.grid, velocity, momentum_and_mass, _region(scene.grid, at))
+    return sweep(scene.grid, constrained, momentum_and_mass, _region(scene.grid, at))
 
 
 def _region(grid: Grid, at: Stencil) -> Region:
@@ -177,94 +189,102 @@ def _region(grid: Grid, at: Stencil) -> Region:
 
 
 def _grid_to_particles(
-    scene: Scene, at: Stencil, grid_v: Float[Array, "*grid d"]
-) -> tuple[Float[Array, "p d"], Float[Array, "p d d"], Float[Array, "p d d"]]:
-    """`v = Σ w v_i`, `C = Σ w v_i (x_i − x_p)ᵀ/D` and the gradient L that deforms (eq. 3)."""
-    v, moment, slope = gather(scene.grid, at, grid_v, slope=scene.scheme.needs_slope)
-    C = moment / scene.spline.moment / scene.grid.h
-    L = scene.scheme.velocity_gradient(C, slope)
-    return v, C, L
-
-
-def _update(
     scene: Scene,
     state: State,
+    at: Stencil,
+    finite: Bool[Array, " p"],
     held: Bool[Array, " p"],
-    v: Float[Array, "p d"],
-    C: Float[Array, "p d d"],
-    L: Float[Array, "p d d"],
+    grid_v: Float[Array, "*grid c"],
     dt: Scalar,
 ) -> State:
     """Move and deform the particles, then return to the yield surface."""
-    alive = state.alive
-    v = jnp.where(held[:, None], state.v, v)
-    damped = _damp_shear(C, scene.shear_damping, dt)
-    C = jnp.where(held[:, None, None], state.C, damped)
-    L = _embed(L)
-    He, history = _return_map(scene, state, _stretched(state.He, L, dt), dt)
-    H = None if state.H is None else _where(alive, _stretched(state.H, L, dt), state.H)
+    particles = Receiver(
+        alive=state.alive,
+        finite=finite,
+        held=held,
+        xi=at.xi,
+        nodes=scene.grid.unfold(grid_v),
+        position=state.position,
+        v=state.v,
+        C=state.C,
+        He=state.He,
+        H=state.He[:, :0] if state.H is None else state.H,
+    )
+    # r = ∞ and r = 0 are both exact.
+    kept = jnp.exp(-scene.shear_damping * dt)
+    moment = jnp.asarray(scene.spline.moment, state.dtype)
+    numbers, degree = jnp.stack([dt, scene.grid.h, moment, kept]), scene.spline.degree
+    native = _native_mapping(scene, state)
+    if native is not None:
+        out = receive_natively(particles, *native, scene.scheme, numbers, degree=degree)
+        material, history = scene.materials[0], state.history[0]
+        if material.plasticity is not None:
+            history = material.plasticity.remember(history, out.history)
+        histories = (history,)
+    else:
+        mapping = functools.partial(_return_map, scene, state.history, dt)
+        plastic = scene.is_plastic
+        out = receive(particles, mapping if plastic else None, scene.scheme, numbers, degree=degree)
+        histories = out.history if plastic else state.history
+
+    def kept_where_dead(part: slice, new: Any, old: Any) -> Any:
+        return jax.tree.map(functools.partial(jnp.where, state.alive[part]), new, old)
+
     return State(
-        position=_where(alive, state.position + dt * v, state.position),
-        v=_where(alive, v, 0),
-        C=_where(alive, C, 0),
-        He=_where(alive, He, state.He),
-        H=H,
-        history=history,
-        alive=alive,
+        position=out.position,
+        v=out.v,
+        C=out.C,
+        He=out.He,
+        H=None if state.H is None else out.H,
+        history=tuple(map(kept_where_dead, scene.slices, histories, state.history)),
+        alive=state.alive,
         step=state.step + 1,
         status=state.status,
         origin=state.origin,
     )
 
 
-def _stretched(
-    H: Float[Array, "p 3 3"], L: Float[Array, "p 3 3"], dt: Scalar
-) -> Float[Array, "p 3 3"]:
-    """`F ← (I + Δt L) F`, written on `H = F − I`."""
-    return H + dt * (L + L @ H)
+def _native_mapping(scene: Scene, state: State) -> tuple[str, tuple[Array, ...]] | None:
+    """The mapping a native kernel of the whole stage knows, and its parameters."""
+    if not isinstance(scene.scheme, MLS | SplineGradient):
+        return None
+    if not scene.is_plastic:
+        return "elastic", ()
+    (material, *others), history = scene.materials, state.history[0]
+    if others:
+        return None
+    assert material.plasticity is not None
+    name = material.plasticity.kernel()
+    if name is None:
+        return None
 
+    def parameters(material: Material, history: Array | None) -> tuple[Array, ...]:
+        assert material.plasticity is not None
+        assert isinstance(material.elasticity, AbstractElasticity)
+        return material.plasticity.parameters(history, material.elasticity)
 
-def _damp_shear(C: Float[Array, "p d d"], rate: Scalar, dt: Scalar) -> Float[Array, "p d d"]:
-    """RPIC as a rate: the symmetric part of C times `exp(−r Δt)`."""
-    transposed = jnp.swapaxes(C, 1, 2)
-    # r = ∞ and r = 0 are both exact.
-    kept = jnp.exp(-rate * dt)
-    return (C - transposed) / 2 + kept * (C + transposed) / 2
+    axes = particle_axes(material, state.v.shape[0]), None if history is None else 0
+    if jax.tree.leaves(axes):
+        parameters = jax.vmap(parameters, in_axes=axes)
+    return name, parameters(material, history)
 
 
 def _return_map(
-    scene: Scene, state: State, H: Float[Array, "p 3 3"], dt: Scalar
-) -> tuple[Float[Array, "p 3 3"], tuple]:
+    scene: Scene, histories: tuple[Any, ...], dt: Scalar, H: Float[Array, "p 3 3"]
+) -> tuple[Float[Array, "p 3 3"], tuple[Any, ...]]:
     """Each material maps its own slice; a slice without plasticity passes unchanged."""
-    parts, histories = [], []
-    for material, part, history in zip(scene.materials, scene.slices, state.history, strict=True):
+    parts, new = [], []
+    for material, part, history in zip(scene.materials, scene.slices, histories, strict=True):
         if material.plasticity is None:
             parts.append(H[part])
-            histories.append(history)
+            new.append(history)
             continue
 
         def mapping(material, H, history):
             return material.plasticity.return_map(H, history, material.elasticity, dt)
 
         axes = (particle_axes(material, part.stop - part.start), 0, 0)
-        alive = state.alive[part]
-        mapped, new = jax.vmap(mapping, in_axes=axes)(material, _where(alive, H[part], 0), history)
+        mapped, remembered = jax.vmap(mapping, in_axes=axes)(material, H[part], history)
         parts.append(mapped)
-        histories.append(jax.tree.map(functools.partial(jnp.where, alive), new, history))
-    return jnp.concatenate(parts), tuple(histories)
-
-
-def _where(mask: Bool[Array, " p"], a: Array, b: Array | int) -> Array:
-    """`where`, the mask being per particle."""
-    return jnp.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-
-
-def _finite(a: Array) -> Bool[Array, " p"]:
-    """Whether every entry of a particle's value is finite."""
-    return jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim)))
-
-
-def _embed(A: Float[Array, "p d d"]) -> Float[Array, "p 3 3"]:
-    """A 2×2 tensor as the upper corner of a 3×3 one (plane strain); 3×3 unchanged."""
-    missing = 3 - A.shape[-1]
-    return jnp.pad(A, ((0, 0), (0, missing), (0, missing))) if missing else A
+        new.append(remembered)
+    return jnp.concatenate(parts), tuple(new)

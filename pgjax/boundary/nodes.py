@@ -44,10 +44,10 @@ def change_if(needed: Bool[Array, ""], change: Callable[[Vectors], Vectors], v: 
 
 def sweep(
     grid: Grid,
-    one: Callable[[Vectors, Float[Array, "c n"], Region], Vectors],
+    one: Callable[[Vectors, Float[Array, "c n"], Region], Float[Array, "c n"]],
     values: Float[Array, "*grid c"],
     region: Region,
-) -> Float[Array, "*grid d"]:
+) -> Float[Array, "*grid c"]:
     """`one(x, values, region)` for the nodes of every slab that reaches into the region, else 0.
 
     A slab is a few layers of nodes across the first direction. Components come first, `(d, n)`:
@@ -55,7 +55,7 @@ def sweep(
 
     Args:
         grid: the grid.
-        one: a vector for each of n nodes at x, m, from their values.
+        one: new values for each of n nodes at x, m.
         values: of the nodes.
         region: where there is mass.
     """
@@ -65,11 +65,11 @@ def sweep(
     def everything(x0: Float[Array, " k"], values: Array, region: Region) -> Array:
         x = jnp.stack(jnp.meshgrid(x0, *others, indexing="ij")).reshape(d, -1)
         new = one(x, values.reshape(-1, values.shape[-1]).T, region)
-        return new.T.reshape(*values.shape[:-1], d)
+        return new.T.reshape(values.shape)
 
     def nothing(x0: Float[Array, " k"], values: Array, region: Region) -> Array:
         del x0, region
-        return jnp.zeros((*values.shape[:-1], d), values.dtype)
+        return jnp.zeros_like(values)
 
     def slab(args: tuple[Float[Array, " k"], Array]) -> Array:
         x0, values = args
@@ -83,7 +83,7 @@ def sweep(
     # Slabs go in and out as a list: the derivative of a grid that is carried along and updated in
     # place copies the whole of it for each slab.
     slabs = tuple(a.reshape(-1, layers, *a.shape[1:]) for a in (first, values))
-    return jax.lax.map(jax.checkpoint(slab, prevent_cse=False), slabs).reshape(*grid.node_shape, d)
+    return jax.lax.map(jax.checkpoint(slab, prevent_cse=False), slabs).reshape(values.shape)
 
 
 def _layers(nodes: Sequence[int]) -> int:

@@ -5,6 +5,7 @@ neo-Hookean law needs even those. Working from H instead of F keeps the stress a
 rounding at every strain: from F, float32 loses digits as 1e-7/strain.
 """
 
+from collections.abc import Callable
 from typing import final
 
 import jax
@@ -139,10 +140,32 @@ def _neo_hookean_stress(H: Matrix3, mu: Scalar, lam: Scalar) -> tuple[Matrix3, S
     return mu * left_strain(H) + lam * log_J * identity(H), volume_change(H)
 
 
-_OPERANDS = (2, 0, 0)
-_fixed_corotated = per_particle("fixed_corotated", "laws", _fixed_corotated_stress, _OPERANDS)
-_stvk_hencky = per_particle("stvk_hencky", "laws", _stvk_hencky_stress, _OPERANDS)
-_neo_hookean = per_particle("neo_hookean", "laws", _neo_hookean_stress, _OPERANDS)
+_fixed_corotated = per_particle("fixed_corotated", "laws", _fixed_corotated_stress, 2)
+_stvk_hencky = per_particle("stvk_hencky", "laws", _stvk_hencky_stress, 2)
+_neo_hookean = per_particle("neo_hookean", "laws", _neo_hookean_stress, 2)
+
+
+def _fixed_corotated_response(H: Matrix3, mu: Scalar, lam: Scalar) -> Response:
+    tau, change = _fixed_corotated(H, mu, lam)
+    return Response(tau, change <= -1, jnp.zeros((), bool))
+
+
+def _stvk_hencky_response(H: Matrix3, mu: Scalar, lam: Scalar) -> Response:
+    tau, change, smallest = _stvk_hencky(H, mu, lam)
+    return Response(tau, change <= -1, smallest < SMALLEST_STRETCH)
+
+
+def _neo_hookean_response(H: Matrix3, mu: Scalar, lam: Scalar) -> Response:
+    tau, change = _neo_hookean(H, mu, lam)
+    return Response(tau, change <= -1, change <= SMALLEST_VOLUME_RATIO - 1)
+
+
+# Laws of H, μ and λ that a step can run as part of one native kernel (`native/exchange.h`).
+RESPONSES: dict[str, Callable[[Matrix3, Scalar, Scalar], Response]] = {
+    "fixed_corotated": _fixed_corotated_response,
+    "stvk_hencky": _stvk_hencky_response,
+    "neo_hookean": _neo_hookean_response,
+}
 
 
 @final
@@ -159,6 +182,10 @@ class FixedCorotated(AbstractElasticity):
     E: Array = parameter()
     nu: Array = parameter()
 
+    def kernel(self) -> str | None:
+        """`fixed_corotated` of `RESPONSES`."""
+        return "fixed_corotated"
+
     def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
         """`τ = 2μ (b − V) + λ J (J − 1) I`, Pa."""
         return self.response(H, L, history).tau
@@ -166,8 +193,7 @@ class FixedCorotated(AbstractElasticity):
     def response(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Response:
         """The stress and what the status counts; the law is never clamped."""
         del L, history
-        tau, change = _fixed_corotated(H, self.mu, self.lam)
-        return Response(tau, change <= -1, jnp.zeros((), bool))
+        return _fixed_corotated_response(H, self.mu, self.lam)
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
         """`μ Σ (σ − 1)² + λ/2 (J − 1)²`, J/m³ of rest volume."""
@@ -204,6 +230,10 @@ class StVKHencky(AbstractElasticity):
     E: Array = parameter()
     nu: Array = parameter()
 
+    def kernel(self) -> str | None:
+        """`stvk_hencky` of `RESPONSES`."""
+        return "stvk_hencky"
+
     def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
         """`τ = 2μ ε + λ tr(ε) I`, Pa."""
         return self.response(H, L, history).tau
@@ -211,8 +241,7 @@ class StVKHencky(AbstractElasticity):
     def response(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Response:
         """The stress and what the status counts."""
         del L, history
-        tau, change, smallest = _stvk_hencky(H, self.mu, self.lam)
-        return Response(tau, change <= -1, smallest < SMALLEST_STRETCH)
+        return _stvk_hencky_response(H, self.mu, self.lam)
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
         """`μ ‖ε‖² + λ/2 tr²(ε)`, J/m³ of rest volume."""
@@ -262,6 +291,10 @@ class NeoHookean(AbstractElasticity):
     E: Array = parameter()
     nu: Array = parameter()
 
+    def kernel(self) -> str | None:
+        """`neo_hookean` of `RESPONSES`."""
+        return "neo_hookean"
+
     def kirchhoff(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Matrix3:
         """`τ = μ B + λ log J I`, Pa."""
         return self.response(H, L, history).tau
@@ -269,8 +302,7 @@ class NeoHookean(AbstractElasticity):
     def response(self, H: Matrix3, L: Matrix3, history: Array | None = None) -> Response:
         """The stress and what the status counts."""
         del L, history
-        tau, change = _neo_hookean(H, self.mu, self.lam)
-        return Response(tau, change <= -1, change <= SMALLEST_VOLUME_RATIO - 1)
+        return _neo_hookean_response(H, self.mu, self.lam)
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
         """`μ/2 (tr B − 2 log J) + λ/2 log²J`, J/m³ of rest volume (J > 0.01)."""

@@ -44,6 +44,10 @@ class AbstractLaw(eqx.Module):
     def rest_modulus(self, dimension: int) -> Array:
         """`ρ₀ c²` at rest, Pa: one value, or one per particle where the parameters are."""
 
+    def kernel(self) -> str | None:
+        """The name in `elasticity.RESPONSES` of a law that is a function of H, μ and λ alone."""
+        return None
+
     def shear_viscosity(self) -> Array:
         """η of a viscous stress `2 η J sym L` (or its deviator), Pa·s; 0 where there is none."""
         return jnp.zeros(())

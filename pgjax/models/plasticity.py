@@ -48,6 +48,22 @@ class AbstractPlasticity(eqx.Module):
         """What one particle remembers at the start; None if nothing."""
         return None
 
+    def kernel(self) -> str | None:
+        """The name in `MAPPINGS` of a mapping that has a native kernel."""
+        return None
+
+    def parameters(
+        self, history: Array | None, elasticity: AbstractElasticity
+    ) -> tuple[Array, ...]:
+        """What a mapping of `MAPPINGS` takes beside H, of one particle."""
+        del history, elasticity
+        return ()
+
+    def remember(self, history: Array | None, mapped: Array) -> Array | None:
+        """The new history, from what a mapping of `MAPPINGS` returns beside H."""
+        del mapped
+        return history
+
 
 def _expm1_map(delta: Matrix3, Q: Matrix3) -> Matrix3:
     """`exp(Δ) − I` of a symmetric Δ whose eigenvectors are the columns of Q."""
@@ -135,15 +151,16 @@ def _map_drucker_prager(
     return _along(lambda eps: _cone_return(eps, slope, apex, gained, correct=correct), H, gained)
 
 
-_von_mises = per_particle("von_mises", "laws", _map_von_mises, (2, 0, 0))
-_drucker_prager = {
-    correct: per_particle(
-        "drucker_prager",
-        "laws",
-        functools.partial(_map_drucker_prager, correct=correct),
-        (2, 0, 0, 0),
-    )
-    for correct in (False, True)
+# Mappings `(H, *parameters) -> (H, what is remembered)` that a step can run as part of one native
+# kernel (`native/exchange.h`).
+MAPPINGS: dict[str, Callable[..., tuple[Array, ...]]] = {
+    "von_mises": per_particle("von_mises", "laws", _map_von_mises, 2),
+    **{
+        name: per_particle(
+            "drucker_prager", "laws", functools.partial(_map_drucker_prager, correct=correct), 2
+        )
+        for name, correct in (("drucker_prager", False), ("drucker_prager_corrected", True))
+    },
 }
 
 
@@ -208,9 +225,22 @@ class VonMises(AbstractPlasticity):
     ) -> tuple[Matrix3, Array | None]:
         """Radial return of the deviator of the Hencky strain."""
         del dt
-        mu = elasticity.mu
-        H, dgamma = _von_mises(H, self.current_yield_stress(history, mu), mu)
-        return H, None if history is None else history + dgamma
+        H, dgamma = MAPPINGS[self.kernel()](H, *self.parameters(history, elasticity))
+        return H, self.remember(history, dgamma)
+
+    def kernel(self) -> str:
+        """`von_mises`."""
+        return "von_mises"
+
+    def parameters(
+        self, history: Array | None, elasticity: AbstractElasticity
+    ) -> tuple[Array, ...]:
+        """τ_Y and μ."""
+        return self.current_yield_stress(history, elasticity.mu), elasticity.mu
+
+    def remember(self, history: Array | None, mapped: Array) -> Array | None:
+        """The sum of δγ."""
+        return None if history is None else history + mapped
 
 
 @final
@@ -259,13 +289,26 @@ class DruckerPrager(AbstractPlasticity):
     ) -> tuple[Matrix3, Array | None]:
         """Return of the Hencky strain to the cone along its deviator, or to the tip."""
         del dt
-        zero = jnp.zeros((), H.dtype)
+        H, gained = MAPPINGS[self.kernel()](H, *self.parameters(history, elasticity))
+        return H, self.remember(history, gained)
+
+    def kernel(self) -> str:
+        """`drucker_prager`, with or without the correction of the volume."""
+        return "drucker_prager_corrected" if self.volume_correction else "drucker_prager"
+
+    def parameters(
+        self, history: Array | None, elasticity: AbstractElasticity
+    ) -> tuple[Array, ...]:
+        """`α (3λ + 2μ)/(2μ)`, cohesion and the volume gained."""
         mu, lam = elasticity.mu, elasticity.lam
+        zero = jnp.zeros((), mu.dtype)
         slope = self.alpha * (3 * lam + 2 * mu) / (2 * mu)
         apex = zero if self.cohesion is None else self.cohesion
-        gained = zero if history is None else history
-        H, gained = _drucker_prager[self.volume_correction](H, slope, apex, gained)
-        return H, None if history is None else gained
+        return slope, apex, zero if history is None else history
+
+    def remember(self, history: Array | None, mapped: Array) -> Array | None:
+        """The volume gained."""
+        return None if history is None else mapped
 
 
 def _h_or_one(h: Any) -> Array | None:

@@ -31,6 +31,8 @@ from pgjax._types import Array
 
 # What each source holds.
 HANDLERS = {
+    "exchange": ("send", "velocities", "receive"),
+    "exchange_pull": ("send_pull", "velocities_pull", "receive_pull"),
     "transfer": ("scatter", "scatter_tangent", "gather", "gather_tangent", "pull"),
     "eigen": ("eigenbasis", "svd"),
     "laws": ("neo_hookean", "fixed_corotated", "stvk_hencky", "von_mises", "drucker_prager"),

@@ -512,13 +512,27 @@ class Columns {
   // Calls `scatter(p)` for every particle; the sums do not depend on the number of threads.
   template <class F>
   void for_each(Pool& pool, const F& scatter) const {
+    for_each_group(pool, 1, [&](const std::int32_t* p, int) { scatter(*p); });
+  }
+  // The same, with up to `size` particles of a column at a time: `scatter(first, count)`.
+  template <class F>
+  void for_each_group(Pool& pool, int size, const F& scatter) const {
+    for_each_numbered_group(pool, size,
+                            [&](const std::int32_t* first, int count, Index) { scatter(first, count); });
+  }
+  // And with a number of the group, below `groups(size)`.
+  template <class F>
+  void for_each_numbered_group(Pool& pool, int size, const F& scatter) const {
     for (const auto& colour : colours_) {
       pool.run(Index(colour.size()), [&](Index i) {
         const Index k = colour[i];
-        for (Index j = start_[k]; j < start_[k + 1]; ++j) scatter(order_[j]);
+        for (Index j = start_[k]; j < start_[k + 1]; j += size)
+          scatter(order_.data() + j, int(std::min<Index>(size, start_[k + 1] - j)),
+                  k + start_[k] / size + (j - start_[k]) / size);
       });
     }
   }
+  Index groups(int size) const { return Index(start_.size()) + Index(order_.size()) / size + 1; }
 
  private:
   Index across_;

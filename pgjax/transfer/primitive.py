@@ -26,7 +26,7 @@ from pgjax._types import Array
 from pgjax.transfer import reference
 
 # Values of a node in the native kernels (`kChannels` in native/transfer.h).
-_CHANNELS = 4
+CHANNELS = 4
 
 Arrays = tuple[Array, ...]
 Shape = tuple[int, ...]
@@ -108,7 +108,7 @@ def _define(
         wanted = results(*(a.shape for a in operands), **static)
         channels = [a.shape[-1] for a, kind in zip(operands, kinds_in, strict=True) if kind == "a"]
         # The kernels count particles in 32 bits.
-        unfit = max(channels) > _CHANNELS or operands[0].shape[1] >= 2**31
+        unfit = max(channels) > CHANNELS or operands[0].shape[1] >= 2**31
         if library is None or unfit:
             return plain(*operands, **static)
         packed = map(_pack, operands, kinds_in)
@@ -141,16 +141,21 @@ def _packed_shape(shape: Shape, kind: str) -> Shape:
     if kind == "x":
         return shape
     if kind == "a":
-        return (*shape[:-1], _CHANNELS)
+        return (*shape[:-1], CHANNELS)
     # An absent flux keeps a direction of length 0.
-    return (*shape[:-2], shape[-1], _CHANNELS if shape[-1] else 0)
+    return (*shape[:-2], shape[-1], CHANNELS if shape[-1] else 0)
 
 
 def _pack(a: Array, kind: str) -> Array:
-    shape = _packed_shape(a.shape, kind)
+    if kind == "x":
+        return a
     a = jnp.swapaxes(a, -1, -2) if kind == "B" else a
-    missing = shape[-1] - a.shape[-1]
-    return jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)]) if missing > 0 else a
+    return with_channels(a) if a.shape[-2] or kind == "a" else a[..., :0]
+
+
+def with_channels(a: Array) -> Array:
+    """Filled up to four channels."""
+    return jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, CHANNELS - a.shape[-1])])
 
 
 def _unpack(a: Array, shape: Shape, kind: str) -> Array:

@@ -74,7 +74,8 @@ def stencil(
     centre = jnp.asarray(grid.shape, x.dtype) / 2
 
     def of_one(x: Float[Array, " d"]) -> tuple[Float[Array, " d"], Bool[Array, ""]]:
-        xi = grid.cells(x)
+        # So that what is not finite has no derivative; the caller looks at it.
+        xi = grid.cells(jnp.where(jnp.isfinite(x), x, 0))
         inside = grid.contains(spline.base(xi), spline.width)
         return jnp.where(inside, xi, centre), inside
 

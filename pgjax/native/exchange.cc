@@ -1,0 +1,74 @@
+// What XLA calls: one library per precision (PGJAX_DOUBLE) and dimension (PGJAX_D).
+//
+// Arrays may have a leading batch direction; nodes hold four values.
+// Without a total deformation H has no elements.
+#include "exchange_call.h"
+
+namespace {
+
+ffi::Error Send(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::int64_t law, Mask alive,
+                Mask inside, In xi, In position, In mass, In volume, In v, In C, In He, In H, In mu,
+                In lam, In numbers, Out g, MaskOut still_alive, MaskOut finite,
+                ffi::Result<ffi::Buffer<ffi::S32>> events) {
+  Pool pool = pool_of(threads);
+  const auto shape = shape_of(xi, *g);
+  const auto in = sender(alive, inside, xi, position, mass, volume, v, C, He, H, mu, lam, numbers);
+  const Sent<T> out{each(g, D + 1), each(still_alive, 1), each(finite, 1), each(events, 1)};
+  return with_kind(degree, mls, [&](auto K, auto Mls) {
+    const auto run = [&](auto kind) {
+      send<T, D, K, Mls, decltype(kind)>(shape, batch_size(*g, D + 1), in, out, pool);
+    };
+    if (law == 0) run(NeoHookean<T>());
+    if (law == 1) run(FixedCorotated<T>());
+    if (law == 2) run(StVKHencky<T>());
+  });
+}
+
+ffi::Error Velocities(ffi::ThreadPool threads, In momentum_and_mass, In numbers, Out v_and_mass) {
+  Pool pool = pool_of(threads);
+  const Index batch = batch_size(*v_and_mass, D + 1);
+  const Index nodes = Index(v_and_mass->element_count()) / (batch * kChannels);
+  velocities<T, D>(nodes, batch, shared_or_each(momentum_and_mass, D + 1), shared_or_each(numbers, 1),
+                   each(v_and_mass, D + 1), pool);
+  return ffi::Error::Success();
+}
+
+ffi::Error Receive(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::int64_t map,
+                   Mask alive, Mask finite, Mask held, In xi, In g, In position, In v, In C, In He,
+                   In H, In first, In second, In third, In numbers, Out new_position, Out new_v,
+                   Out new_C, Out new_He, Out new_H, Out history) {
+  Pool pool = pool_of(threads);
+  const auto shape = shape_of(xi, g);
+  const auto in = receiver(alive, finite, held, xi, g, position, v, C, He, H, first, second, third,
+                           numbers);
+  const Received<T> out{each(new_position, 2), each(new_v, 2), each(new_C, 3),
+                        each(new_He, 3),       each(new_H, 3), each(history, 1)};
+  return with_kind(degree, mls, [&](auto K, auto Mls) {
+    const auto run = [&](auto kind) {
+      receive<T, D, K, Mls, decltype(kind)>(shape, batch_size(*new_v, 2), in, out, pool);
+    };
+    if (map == 0) run(Elastic<T>());
+    if (map == 1) run(VonMises<T>());
+    if (map == 2) run(DruckerPrager<T>());
+  });
+}
+
+}  // namespace
+
+#define PGJAX_CALL()                                                                     \
+  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("degree").Attr<bool>("mls") \
+      .Attr<std::int64_t>("kind")
+#define PGJAX_RET Ret<ffi::Buffer<kType>>()
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send, Send,
+                              PGJAX_CALL().Arg<Mask>().Arg<Mask>().Arg<In>().Arg<In>().Arg<In>()
+                                  .Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()
+                                  .Arg<In>().Arg<In>().PGJAX_RET.Ret<Mask>().Ret<Mask>()
+                                  .Ret<ffi::Buffer<ffi::S32>>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_velocities, Velocities,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Arg<In>().Arg<In>().PGJAX_RET);
+XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_receive, Receive,
+                              PGJAX_CALL().Arg<Mask>().Arg<Mask>().Arg<Mask>().Arg<In>().Arg<In>()
+                                  .Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()
+                                  .Arg<In>().Arg<In>().Arg<In>()
+                                  .PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET);

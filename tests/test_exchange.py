@@ -1,0 +1,145 @@
+"""The two halves of a step as native kernels against the same in JAX, and their derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pgjax import exchange, native
+from pgjax.exchange import Receiver, Sender
+
+pytestmark = pytest.mark.skipif(not native.available(), reason="there are no native kernels")
+
+N = 41
+DOUBLE = jax.config.jax_enable_x64
+NODES = {2: (11, 12), 3: (11, 12, 13)}
+EPS = float(jnp.finfo(jnp.zeros(()).dtype).eps)
+
+
+def floats(a):
+    return jnp.asarray(a, jnp.zeros(()).dtype)
+
+
+def sender(d, *, seed=0, plastic=False):
+    """Particles of every kind: masked, outside, not finite, inverted, crushed, at rest."""
+    rng = np.random.default_rng(seed)
+    He = 0.3 * rng.normal(size=(N, 3, 3))
+    He[:6] = 0
+    He[6] = np.diag([-1.5, 0, 0])
+    He[7] = np.diag([-0.97, -0.9, 0.1])
+    xi = rng.uniform(1, 6, (N, d))
+    v, C = rng.normal(size=(N, d)), rng.normal(size=(N, d, d))
+    v[9, 0], C[10, 1, 0], He[11, 2, 1] = np.nan, np.inf, np.nan
+    H = 0.2 * rng.normal(size=(N, 3, 3))[:, : 3 if plastic else 0]
+    alive, inside = np.ones(N, bool), np.ones(N, bool)
+    alive[12:14], inside[14] = False, False
+    mass, volume = rng.uniform(1, 2, N), rng.uniform(0.5, 1, N)
+    operands = (xi, xi / 8, mass, volume, v, C, He, H)
+    return Sender(jnp.asarray(alive), jnp.asarray(inside), *map(floats, operands))
+
+
+def receiver(d, *, seed=0, plastic=False):
+    s = sender(d, seed=seed, plastic=plastic)
+    rng = np.random.default_rng(seed + 1)
+    nodes = rng.normal(size=(*NODES[d], d + 1))
+    finite = np.ones(N, bool)
+    finite[9:12] = False
+    held = rng.uniform(size=N) < 0.2
+    return Receiver(
+        alive=s.alive & finite & s.inside,
+        finite=jnp.asarray(finite),
+        held=jnp.asarray(held),
+        xi=s.xi,
+        nodes=floats(nodes),
+        position=s.position,
+        v=s.v,
+        C=s.C,
+        He=s.He,
+        H=s.H,
+    )
+
+
+def parameters(count, *, each, seed=3):
+    rng = np.random.default_rng(seed)
+    return [floats(rng.uniform(1, 2, N if each else 1)) for _ in range(count)]
+
+
+def close(actual, expected, tolerance):
+    """All arrays, each relative to its largest entry."""
+    for a, b in zip(actual, expected, strict=True):
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        a, b = np.asarray(a), np.asarray(b)
+        if a.dtype.kind in "bi":
+            np.testing.assert_array_equal(a, b)
+        elif a.size:
+            np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(np.abs(b).max(), 1e-30))
+
+
+def floating(out):
+    return [o for o in out if jnp.issubdtype(o.dtype, jnp.floating)]
+
+
+def pulled(function, masks, operands, seed=5):
+    """Cotangents of the floating operands for random ones of the results."""
+    fixed, floats_ = operands[:masks], operands[masks:]
+    out, pull = jax.vjp(lambda *a: floating(function(*fixed, *a)), *floats_)
+    rng = np.random.default_rng(seed)
+    return pull([floats(rng.normal(size=o.shape)) for o in out])
+
+
+SENDERS = [
+    (law, d, degree, mls)
+    for law in ("neo_hookean", "fixed_corotated", "stvk_hencky")
+    for d in (2, 3)
+    for degree, mls in (
+        ((2, True), (3, False)) if law != "stvk_hencky" else ((2, False), (3, True))
+    )
+]
+MAPS = ("elastic", "von_mises", "drucker_prager", "drucker_prager_corrected")
+# Degree and scheme: each pair with each law and dimension, but not all of all.
+RECEIVERS = [
+    (m, d, degree, mls)
+    for i, m in enumerate(MAPS)
+    for d in (2, 3)
+    for degree, mls in (((2, True), (3, False)) if i % 2 else ((2, False), (3, True)))
+]
+
+
+def send_case(law, d, degree, mls, each):
+    operands = (*sender(d, plastic=each), *parameters(2, each=each), floats([0.1, 0.5, 0.3]))
+    return operands, {"law": law, "degree": degree, "nodes": NODES[d], "mls": mls}
+
+
+def receive_case(mapping, d, degree, mls, each):
+    given = {"elastic": 0, "von_mises": 2}.get(mapping, 3)
+    scale = [0.2, 1.0] if given == 2 else [0.3, 0.05, 0.2]
+    values = [s * p for s, p in zip(scale, parameters(given, each=each), strict=False)]
+    values += [floats([])] * (3 - given)
+    p = receiver(d, plastic=given > 0)
+    operands = (*p, *values, floats([0.1, 0.5, (degree + 1) / 12, 0.7]))
+    return operands, {"mapping": mapping, "degree": degree, "mls": mls}
+
+
+@pytest.mark.parametrize(("law", "d", "degree", "mls"), SENDERS)
+def test_send_is_what_it_says(law, d, degree, mls):
+    for each in (False, True):
+        operands, static = send_case(law, d, degree, mls, each)
+        native_one = functools.partial(exchange._send, **static)
+        plain = functools.partial(exchange._send_plain, **static)
+        close(native_one(*operands), jax.jit(plain)(*operands), 100 * EPS)
+        if DOUBLE:
+            close(pulled(native_one, 2, operands), pulled(plain, 2, operands), 1e-9)
+
+
+@pytest.mark.parametrize(("mapping", "d", "degree", "mls"), RECEIVERS)
+def test_receive_is_what_it_says(mapping, d, degree, mls):
+    for each in (False, True):
+        operands, static = receive_case(mapping, d, degree, mls, each)
+        native_one = functools.partial(exchange._receive, **static)
+        plain = functools.partial(exchange._receive_plain, **static)
+        close(native_one(*operands), jax.jit(plain)(*operands), 300 * EPS)
+        if DOUBLE:
+            close(pulled(native_one, 3, operands), pulled(plain, 3, operands), 1e-9)
