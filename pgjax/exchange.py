@@ -17,6 +17,7 @@ import numpy as np
 from pgjax import native
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Int
+from pgjax.boundary.contact import AbstractContact, Separating, Slip, Sticky
 from pgjax.models.elasticity import RESPONSES
 from pgjax.models.law import Response
 from pgjax.models.plasticity import MAPPINGS
@@ -239,6 +240,20 @@ def embed(A: Float[Array, "p d d"]) -> Float[Array, "p 3 3"]:
 
 _LAWS = ("neo_hookean", "fixed_corotated", "stvk_hencky")
 _MAPS = ("elastic", "von_mises", "drucker_prager")
+_CONTACTS = ("none", "sticky", "slip", "separating")
+_CONTACT_TYPES = (type(None), Sticky, Slip, Separating)
+
+
+def known(contact: AbstractContact) -> bool:
+    """Whether `velocities` takes it."""
+    return type(contact) in _CONTACT_TYPES
+
+
+def contact_of(name: str, friction: Array) -> AbstractContact:
+    """The contact of a name in `_CONTACTS`."""
+    kind = _CONTACT_TYPES[_CONTACTS.index(name)]
+    assert issubclass(kind, AbstractContact)
+    return Separating(friction) if kind is Separating else kind()
 
 
 def _scheme(mls: bool) -> AbstractScheme:
@@ -263,12 +278,27 @@ def _send_plain(
     return tuple(send(p, respond, _scheme(mls), numbers, degree=degree, nodes=nodes))
 
 
-def _velocities_plain(nodes: Array, numbers: Array) -> Arrays:
+def _velocities_plain(*operands: Array, contact: str) -> Arrays:
+    *sides, nodes, numbers, friction = operands
     mass = nodes[..., -1:]
     v = safe_divide(nodes[..., :-1], jnp.broadcast_to(mass, nodes[..., :-1].shape))
     v = numbers[0] * (v + jnp.broadcast_to(numbers[1:], v.shape))
-    v = jnp.where(mass > 0, v, 0)
-    return (jnp.concatenate([v, mass], axis=-1),)
+    if contact != "none":
+        wall = contact_of(contact, friction[0])
+        for axis, side in enumerate(sides[: v.ndim - 1]):
+            v = _touched(wall, axis, side, v)
+    return (jnp.concatenate([jnp.where(mass > 0, v, 0), mass], axis=-1),)
+
+
+def _touched(contact: AbstractContact, axis: int, side: Array, v: Array) -> Array:
+    """The velocities of a grid after the two walls across one direction."""
+    d = v.shape[-1]
+    shape = [1] * d
+    shape[axis] = -1
+    side = jnp.broadcast_to(side.reshape(shape), v.shape[:-1])
+    inward = -side[..., None].astype(v.dtype) * jnp.eye(d, dtype=v.dtype)[axis].reshape(*[1] * d, d)
+    flat = jax.vmap(contact)(v.reshape(-1, d), inward.reshape(-1, d))
+    return jnp.where(side[..., None] != 0, flat.reshape(v.shape), v)
 
 
 def _receive_plain(*operands: Array, mapping: str, degree: int, mls: bool) -> Arrays:
@@ -334,23 +364,41 @@ def _send_pull(
     return tuple(call(*given, packed, **_attributes(_LAWS.index(law), degree, mls)))
 
 
-def _velocities_native(operands: list[Array], types: list[Any]) -> Arrays | None:
-    nodes, numbers = operands
+def _velocities_native(operands: list[Array], types: list[Any], *, contact: str) -> Arrays | None:
+    *sides, nodes, numbers, friction = operands
     target = _kernel("velocities", "exchange", nodes.dtype, nodes.shape[-1] - 1)
     if target is None:
         return None
-    call = jax.ffi.ffi_call(target, _packed_type(nodes), input_output_aliases={0: 0})
-    return (call(primitive.with_channels(nodes), numbers)[..., : types[0].shape[-1]],)
+    call = jax.ffi.ffi_call(target, _packed_type(nodes), input_output_aliases={len(sides): 0})
+    kind = np.int64(_CONTACTS.index(contact))
+    made = call(*sides, primitive.with_channels(nodes), numbers, friction, contact=kind)
+    return (made[..., : types[0].shape[-1]],)
 
 
-def _velocities_pull(operands: list[Array], types: list[Any], **_: Any) -> Arrays | None:
-    nodes, numbers, bar = operands
+def _velocities_tangent(operands: list[Array], types: list[Any], *, contact: str) -> Arrays | None:
+    *sides, nodes, numbers, friction, dnodes, dnumbers, dfriction = operands
+    target = _kernel("velocities_tangent", "exchange", nodes.dtype, nodes.shape[-1] - 1)
+    if target is None:
+        return None
+    kind = np.int64(_CONTACTS.index(contact))
+    packed, dpacked = map(primitive.with_channels, (nodes, dnodes))
+    call = jax.ffi.ffi_call(target, _packed_type(nodes))
+    made = call(*sides, packed, numbers, friction, dpacked, dnumbers, dfriction, contact=kind)
+    return (made[..., : types[0].shape[-1]],)
+
+
+def _velocities_pull(
+    operands: list[Array], types: list[Any], *, contact: str, **_: Any
+) -> Arrays | None:
+    *sides, nodes, numbers, friction, bar = operands
     target = _kernel("velocities_pull", "exchange_pull", nodes.dtype, nodes.shape[-1] - 1)
     if target is None:
         return None
-    call = jax.ffi.ffi_call(target, [_packed_type(nodes), types[1]])
-    made, of_numbers = call(primitive.with_channels(nodes), numbers, primitive.with_channels(bar))
-    return made[..., : nodes.shape[-1]], of_numbers
+    kind = np.int64(_CONTACTS.index(contact))
+    packed, packed_bar = map(primitive.with_channels, (nodes, bar))
+    call = jax.ffi.ffi_call(target, [_packed_type(nodes), *types[1:]])
+    made, *others = call(*sides, packed, numbers, friction, packed_bar, contact=kind)
+    return made[..., : nodes.shape[-1]], *others
 
 
 def _receive_native(
@@ -386,10 +434,15 @@ def _receive_pull(
 
 
 _send = stage("send", _send_plain, 1, _send_native, masks=2, pull=_send_pull)
-_velocities = {
-    d: stage("velocities", _velocities_plain, d + 1, _velocities_native, pull=_velocities_pull)
-    for d in (2, 3)
-}
+_velocities = stage(
+    "velocities",
+    _velocities_plain,
+    1,
+    _velocities_native,
+    masks=3,
+    tangent=_velocities_tangent,
+    pull=_velocities_pull,
+)
 _receive = stage("receive", _receive_plain, 1, _receive_native, masks=3, pull=_receive_pull)
 
 
@@ -410,11 +463,26 @@ def send_natively(
 
 
 def velocities(
-    nodes: Float[Array, "*grid c"], kept: Float[Array, ""], gained: Float[Array, " d"]
+    nodes: Float[Array, "*grid c"],
+    kept: Float[Array, ""],
+    gained: Float[Array, " d"],
+    walls: tuple[AbstractContact, list[Int[Array, " _"]]] | None = None,
 ) -> Float[Array, "*grid c"]:
-    """From momentum and mass to `kept (v + gained)` and mass; an empty node is at rest."""
+    """From momentum and mass to velocity and mass; an empty node is at rest.
+
+    Args:
+        nodes: momentum, kg m/s, and mass, kg.
+        kept: the part of the velocity that damping leaves.
+        gained: what gravity adds to it before.
+        walls: contact of a box, and for the nodes along each direction −1 behind its lower wall,
+            1 behind its upper one, 0 elsewhere, int8.
+    """
     numbers = jnp.concatenate([kept[None], gained])
-    return _velocities[gained.shape[0]](nodes, numbers)[0]
+    contact, sides = (None, []) if walls is None else walls
+    friction = contact.friction if isinstance(contact, Separating) else jnp.zeros(())
+    padded = [*sides, *[jnp.zeros((0,), jnp.int8)] * (3 - len(sides))]
+    name = _CONTACTS[_CONTACT_TYPES.index(type(contact))]
+    return _velocities(*padded, nodes, numbers, friction[None], contact=name)[0]
 
 
 def receive_natively(

@@ -68,6 +68,7 @@ def simulate(
     progress: bool | Callable[[int, int], None] = False,
     throw: bool = True,
     allow_unstable: bool = False,
+    keep_states: bool = False,
 ) -> Trajectory:
     """Run `frames × substeps` steps and keep `save(state)` of every frame, the first included.
 
@@ -86,6 +87,8 @@ def simulate(
         throw: raise `SimulationError` when a particle was masked. Inside `jit`, `grad` or `vmap`
             nothing can be raised: look at `trajectory.status`.
         allow_unstable: accept a time step above the stable one.
+        keep_states: reverse mode keeps the state of every step, T of them, and so runs forward
+            once less.
 
     Raises:
         ValueError: an argument is out of range, or dt is above the stable bound at rest.
@@ -99,7 +102,7 @@ def simulate(
     _check_dt(scene, dt, allow_unstable)
     report = _meter(frames) if progress is True else progress or None
     trajectory = _rollout(
-        scene, state, jnp.asarray(dt, state.dtype), frames, substeps, save, report
+        scene, state, jnp.asarray(dt, state.dtype), frames, substeps, save, report, keep_states
     )
     if throw:
         trajectory.status.check()
@@ -150,10 +153,12 @@ def _rollout(
     substeps: int,
     save: Callable[[State], Any],
     report: Callable[[int, int], None] | None,
+    keep_states: bool,
 ) -> Trajectory:
     """The nested scans. Frames are grouped, or divided, so that a block has about √T steps."""
     root = math.sqrt(frames * substeps)
-    block = math.ceil(root)
+    block = substeps if keep_states else math.ceil(root)
+    group = frames if keep_states else max(1, round(root / substeps))
 
     def frame(state: State, index: Array) -> tuple[State, Any]:
         advance = jax.checkpoint(lambda s: step(scene, s, dt))
@@ -169,7 +174,7 @@ def _rollout(
         # The blocks of steps inside a frame bound its memory already.
         final, rest = jax.lax.scan(frame, state, jnp.arange(frames, dtype=jnp.int32))
     else:
-        final, rest = checkpointed_scan(frame, state, frames, group=max(1, round(root / substeps)))
+        final, rest = checkpointed_scan(frame, state, frames, group=group)
     saved = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, rest)
     t = (state.step + substeps * jnp.arange(frames + 1, dtype=jnp.int32)).astype(dt.dtype) * dt
     return Trajectory(saved, t, final, final.status)

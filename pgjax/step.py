@@ -8,15 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pgjax import native
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Scalar
-from pgjax.boundary import AbstractGridCondition, Particles, Region, sweep
+from pgjax.boundary import AbstractGridCondition, Box, Particles, Region, sweep
 from pgjax.exchange import (
     EVENTS,
     Receiver,
     Sender,
     embed,
     is_finite,
+    known,
     receive,
     receive_natively,
     send,
@@ -106,9 +108,9 @@ def _particles_to_grid(
     )
     numbers = jnp.stack([dt, scene.grid.h, scene.D])
     shape = {"degree": scene.spline.degree, "nodes": scene.grid.padded_shape}
-    native = _native_law(scene)
-    if native is not None:
-        name, law = native
+    known_law = _native_law(scene)
+    if known_law is not None:
+        name, law = known_law
         sent = send_natively(particles, name, (law.mu, law.lam), scene.scheme, numbers, **shape)
     else:
         respond = functools.partial(_respond, scene, state.history, t)
@@ -163,6 +165,10 @@ def _forces_and_boundaries(
     kept, gained = jnp.exp(-scene.grid_damping * dt), dt * scene.gravity
     if not scene.boundaries:
         return velocities(momentum_and_mass, kept, gained)
+    box, *others = scene.boundaries
+    if isinstance(box, Box) and not others and known(box.contact) and native.available():
+        axes = [a + start for a, start in zip(scene.grid.axes(), scene.grid.origin, strict=True)]
+        return velocities(momentum_and_mass, kept, gained, (box.contact, box.sides(axes)))
 
     def constrained(x: Vectors, momentum_and_mass: Float[Array, "c n"], region: Region) -> Array:
         """Of n nodes, components first."""
@@ -214,9 +220,9 @@ def _grid_to_particles(
     kept = jnp.exp(-scene.shear_damping * dt)
     moment = jnp.asarray(scene.spline.moment, state.dtype)
     numbers, degree = jnp.stack([dt, scene.grid.h, moment, kept]), scene.spline.degree
-    native = _native_mapping(scene, state)
-    if native is not None:
-        out = receive_natively(particles, *native, scene.scheme, numbers, degree=degree)
+    known_map = _native_mapping(scene, state)
+    if known_map is not None:
+        out = receive_natively(particles, *known_map, scene.scheme, numbers, degree=degree)
         material, history = scene.materials[0], state.history[0]
         if material.plasticity is not None:
             history = material.plasticity.remember(history, out.history)

@@ -143,3 +143,38 @@ def test_receive_is_what_it_says(mapping, d, degree, mls):
         close(native_one(*operands), jax.jit(plain)(*operands), 300 * EPS)
         if DOUBLE:
             close(pulled(native_one, 3, operands), pulled(plain, 3, operands), 1e-9)
+
+
+CONTACTS = ("none", "sticky", "slip", "separating")
+
+
+def grid_case(contact, d, seed=7):
+    """Nodes of a box with empty ones, at rest ones and a friction that stops some of them."""
+    rng = np.random.default_rng(seed)
+    nodes = rng.normal(size=(*NODES[d], d + 1))
+    nodes[..., -1] = np.abs(nodes[..., -1]) * (rng.uniform(size=NODES[d]) < 0.8)
+    nodes[1, 1, ..., :-1] = 0
+    behind = [np.zeros(n, np.int8) for n in NODES[d]]
+    if contact != "none":
+        for side in behind:
+            side[:3], side[-2:] = -1, 1
+    sides = [jnp.asarray(b) for b in behind] + [jnp.zeros(0, jnp.int8)] * (3 - d)
+    numbers = [0.9, *rng.normal(size=d)]
+    return (*sides, floats(nodes), floats(numbers), floats([0.4])), {"contact": contact}
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("contact", CONTACTS)
+def test_velocities_are_what_they_say(contact, d):
+    operands, static = grid_case(contact, d)
+    native_one = functools.partial(exchange._velocities, **static)
+    plain = functools.partial(exchange._velocities_plain, **static)
+    close(native_one(*operands), jax.jit(plain)(*operands), 100 * EPS)
+    close(pulled(native_one, 3, operands), pulled(plain, 3, operands), 1000 * EPS)
+    rng = np.random.default_rng(8)
+    along = tuple(floats(rng.normal(size=a.shape)) for a in operands[3:])
+    both = [
+        jax.jvp(lambda *a, f=f: f(*operands[:3], *a), operands[3:], along)[1]
+        for f in (native_one, plain)
+    ]
+    close(*both, 1000 * EPS)

@@ -27,11 +27,12 @@ def one_step(run: Run, scene: Any, state: Any, dt: Any) -> None:
     """The stages of `pgjax.step.step`, in its order; adapt it with that function."""
     t = jnp.zeros_like(dt)
     held, state = run("impose", step._impose, scene, state, t, dt)
-    state, at, tau = run("stencil and law", step._stress, scene, state, t)
-    sums = run("P2G", step._particles_to_grid, scene, state, at, tau, dt)
+    at, inside = run("stencil", step.stencil, scene.grid, scene.spline, state.position)
+    state, finite, sums = run(
+        "stress and P2G", step._particles_to_grid, scene, state, at, inside, t, dt
+    )
     grid_v = run("grid and walls", step._forces_and_boundaries, scene, at, sums, t, dt)
-    v, C, L = run("G2P", step._grid_to_particles, scene, at, grid_v)
-    run("update", step._update, scene, state, held, v, C, L, dt)
+    run("G2P and update", step._grid_to_particles, scene, state, at, finite, held, grid_v, dt)
 
 
 def measure(case: Case, variant: str, repeats: int) -> dict[str, float]:

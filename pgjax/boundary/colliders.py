@@ -6,6 +6,7 @@ nodes on a wall and everything behind it are held, wherever the grid lies.
 
 import abc
 import functools
+from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from pgjax._types import (
     Array,
     Bool,
     Float,
+    Int,
     Scalar,
     as_float_array,
     concrete,
@@ -179,6 +181,16 @@ class Box(AbstractGridCondition):
             walls = functools.partial(self._walls, axis, x)
             v = change_if(low | high, walls, v)
         return v
+
+    def sides(self, axes: Sequence[Float[Array, " n"]]) -> list[Int[Array, " n"]]:
+        """For the nodes of a grid along each direction: −1 behind the lower wall, 1 the upper."""
+        farthest = jnp.stack([jnp.max(jnp.abs(x)) for x in axes])
+        found = []
+        for i, x in enumerate(axes):
+            low = x - self.lower[i] <= _tolerance(farthest, self.lower)
+            high = self.upper[i] - x <= _tolerance(farthest, self.upper)
+            found.append(high.astype(jnp.int8) - low.astype(jnp.int8))
+        return found
 
     def _walls(self, axis: int, x: Vectors, v: Vectors) -> Vectors:
         """The two walls across one direction; no node is behind both."""

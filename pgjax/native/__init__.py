@@ -31,7 +31,7 @@ from pgjax._types import Array
 
 # What each source holds.
 HANDLERS = {
-    "exchange": ("send", "velocities", "receive"),
+    "exchange": ("send", "velocities", "velocities_tangent", "receive"),
     "exchange_pull": ("send_pull", "velocities_pull", "receive_pull"),
     "transfer": ("scatter", "scatter_tangent", "gather", "gather_tangent", "pull"),
     "eigen": ("eigenbasis", "svd"),

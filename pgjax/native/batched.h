@@ -32,12 +32,20 @@ Batched<ffi::NativeType<kAny>> each(ffi::Result<ffi::Buffer<kAny>>& out, int ran
   return {out->typed_data(), batch_step(*out, rank)};
 }
 
+// Nodes along each direction.
+template <class Nodes>
+std::array<Index, D> nodes_of(Nodes& nodes) {
+  std::array<Index, D> n;
+  for (int i = 0; i < D; ++i) n[i] = nodes.dimensions()[i + is_batched(nodes, D + 1)];
+  return n;
+}
+
 template <class Nodes>
 Shape<D> shape_of(In& xi, Nodes& nodes) {
   Shape<D> shape;
   shape.particles = xi.dimensions()[is_batched(xi, 2)];
-  const bool batched = is_batched(nodes, D + 1);
-  for (int i = 0; i < D; ++i) shape.nodes[i] = nodes.dimensions()[i + batched];
+  const auto n = nodes_of(nodes);
+  std::copy(n.begin(), n.end(), shape.nodes);
   return shape;
 }
 

@@ -24,12 +24,25 @@ ffi::Error Send(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::int
   });
 }
 
-ffi::Error Velocities(ffi::ThreadPool threads, In momentum_and_mass, In numbers, Out v_and_mass) {
+ffi::Error Velocities(ffi::ThreadPool threads, std::int64_t contact, Sides x, Sides y, Sides z,
+                      In momentum_and_mass, In numbers, In friction, Out v_and_mass) {
   Pool pool = pool_of(threads);
-  const Index batch = batch_size(*v_and_mass, D + 1);
-  const Index nodes = Index(v_and_mass->element_count()) / (batch * kChannels);
-  velocities<T, D>(nodes, batch, shared_or_each(momentum_and_mass, D + 1), shared_or_each(numbers, 1),
-                   each(v_and_mass, D + 1), pool);
+  velocities<T, D>(nodes_of(*v_and_mass).data(), batch_size(*v_and_mass, D + 1),
+                   walls_of(contact, x, y, z), shared_or_each(momentum_and_mass, D + 1),
+                   shared_or_each(numbers, 1), shared_or_each(friction, 1), each(v_and_mass, D + 1),
+                   pool);
+  return ffi::Error::Success();
+}
+
+ffi::Error VelocitiesTangent(ffi::ThreadPool threads, std::int64_t contact, Sides x, Sides y, Sides z,
+                             In momentum_and_mass, In numbers, In friction, In dmomentum_and_mass,
+                             In dnumbers, In dfriction, Out dv_and_mass) {
+  Pool pool = pool_of(threads);
+  velocities_tangent<T, D>(nodes_of(*dv_and_mass).data(), batch_size(*dv_and_mass, D + 1),
+                           walls_of(contact, x, y, z), shared_or_each(momentum_and_mass, D + 1),
+                           shared_or_each(numbers, 1), shared_or_each(friction, 1),
+                           shared_or_each(dmomentum_and_mass, D + 1), shared_or_each(dnumbers, 1),
+                           shared_or_each(dfriction, 1), each(dv_and_mass, D + 1), pool);
   return ffi::Error::Success();
 }
 
@@ -58,6 +71,9 @@ ffi::Error Receive(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::
 #define PGJAX_CALL()                                                                     \
   ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("degree").Attr<bool>("mls") \
       .Attr<std::int64_t>("kind")
+#define PGJAX_WALLS()                                                                          \
+  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("contact").Arg<Sides>().Arg<Sides>() \
+      .Arg<Sides>()
 #define PGJAX_RET Ret<ffi::Buffer<kType>>()
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send, Send,
@@ -66,7 +82,10 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send, Send,
                                   .Arg<In>().Arg<In>().PGJAX_RET.Ret<Mask>().Ret<Mask>()
                                   .Ret<ffi::Buffer<ffi::S32>>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_velocities, Velocities,
-                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Arg<In>().Arg<In>().PGJAX_RET);
+                              PGJAX_WALLS().Arg<In>().Arg<In>().Arg<In>().PGJAX_RET);
+XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_velocities_tangent, VelocitiesTangent,
+                              PGJAX_WALLS().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()
+                                  .Arg<In>().PGJAX_RET);
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_receive, Receive,
                               PGJAX_CALL().Arg<Mask>().Arg<Mask>().Arg<Mask>().Arg<In>().Arg<In>()
                                   .Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()

@@ -182,26 +182,134 @@ void send(const Shape<D>& shape, Index batch, const Sender<T>& in, const Sent<T>
   });
 }
 
-// From momentum and mass of a node to (1 - damping) (v + gravity dt) and mass, in place; an empty
+enum Contact { kNone, kSticky, kSlip, kSeparating };
+
+// The walls of a box: for the nodes along each direction, -1 behind the lower, 1 behind the upper.
+template <int D>
+struct Walls {
+  Contact contact = kNone;
+  Batched<const std::int8_t> side[D];
+};
+
+// What a wall across `axis` does to the velocity of a node (`contact.py`); `inward` is +-1.
+template <int D, class T>
+PGJAX_INLINE void touch(Contact contact, T friction, int axis, T inward, T v[D]) {
+  const T normal_speed = inward * v[axis];
+  if (contact == kSticky)
+    for (int i = 0; i < D; ++i) v[i] = 0;
+  if (contact == kSlip) v[axis] = 0;
+  if (contact != kSeparating || !(normal_speed < 0)) return;
+  v[axis] = 0;
+  T square = 0;
+  for (int i = 0; i < D; ++i) square += v[i] * v[i];
+  const T speed = std::sqrt(square), left = square > 0 ? 1 + friction * normal_speed / speed : 1;
+  for (int i = 0; i < D; ++i) v[i] *= left > 0 ? left : 0;
+}
+
+// Calls `one(node, sides)` for all nodes of a grid of D directions, in chunks along the first two:
+// `sides` are those of the node, `node` its number. The chunk is the third argument.
+template <int D, class F>
+void for_each_node(const Index nodes[D], const Walls<D>& walls, Index b, Pool& pool, const F& one) {
+  Index row = nodes[D - 1], rows = 1;
+  for (int i = 0; i < D - 1; ++i) rows *= nodes[i];
+  const bool bounded = walls.contact != kNone;
+  constexpr Index kRows = 64;
+  pool.run((rows + kRows - 1) / kRows, [&](Index chunk) {
+    const Index end = std::min(rows, (chunk + 1) * kRows);
+    for (Index r = chunk * kRows; r < end; ++r) {
+      std::array<int, D> sides = {};
+      if (bounded) {
+        Index rest = r;
+        for (int i = D - 2; i >= 0; --i) sides[i] = walls.side[i].at(b)[rest % nodes[i]], rest /= nodes[i];
+      }
+      for (Index k = 0; k < row; ++k) {
+        if (bounded) sides[D - 1] = walls.side[D - 1].at(b)[k];
+        one(r * row + k, sides, chunk);
+      }
+    }
+  });
+}
+template <int D>
+Index node_chunks(const Index nodes[D]) {
+  Index rows = 1;
+  for (int i = 0; i < D - 1; ++i) rows *= nodes[i];
+  return rows / 64 + 1;
+}
+
+// From momentum and mass of a node to velocity and mass, in place: damping, gravity, walls; an empty
 // node is at rest. `numbers` are what damping keeps and the D velocities that gravity adds.
 template <class T, int D>
-void velocities(Index nodes, Index batch, Batched<const T> from, Batched<const T> numbers, Batched<T> to,
-                Pool& pool) {
-  constexpr Index kChunk = 1 << 14;
+void velocities(const Index nodes[D], Index batch, const Walls<D>& walls, Batched<const T> from,
+                Batched<const T> numbers, Batched<const T> friction, Batched<T> to, Pool& pool) {
   for_each_member(batch, pool, [&](Index b, Pool& pool) {
     const T *in = from.at(b), *number = numbers.at(b);
+    const T mu = *friction.at(b);
     T* out = to.at(b);
     Vec<T> keeps = {}, gains = {};
     for (int i = 0; i < D; ++i) keeps[i] = number[0], gains[i] = number[0] * number[1 + i];
-    pool.run((nodes + kChunk - 1) / kChunk, [&](Index chunk) {
-      const Index end = std::min(nodes, (chunk + 1) * kChunk);
-      for (Index n = chunk * kChunk; n < end; ++n) {
-        const Vec<T> node = load(in + n * kChannels);
-        const T mass = node[D];
-        Vec<T> v = mass > 0 ? node * (keeps / mass) + gains : Vec<T>{};
-        v[D] = mass;
-        store(out + n * kChannels, v);
+    for_each_node<D>(nodes, walls, b, pool, [&](Index n, const std::array<int, D>& sides, Index) {
+      const Vec<T> node = load(in + n * kChannels);
+      const T mass = node[D];
+      Vec<T> v = mass > 0 ? node * (keeps / mass) + gains : Vec<T>{};
+      v[D] = mass;
+      store(out + n * kChannels, v);
+      if (mass > 0)
+        for (int i = 0; i < D; ++i)
+          if (sides[i]) touch<D>(walls.contact, mu, i, T(-sides[i]), out + n * kChannels);
+    });
+  });
+}
+
+// The derivative of `touch` at v along (dv, dfriction), in place.
+template <int D, class T>
+PGJAX_INLINE void touch_tangent(Contact contact, T friction, T dfriction, int axis, T inward,
+                                const T v[D], T dv[D]) {
+  const T normal_speed = inward * v[axis], d_normal = inward * dv[axis];
+  if (contact == kSticky)
+    for (int i = 0; i < D; ++i) dv[i] = 0;
+  if (contact == kSlip) dv[axis] = 0;
+  if (contact != kSeparating || !(normal_speed < 0)) return;
+  T square = 0, along = 0;
+  for (int i = 0; i < D; ++i)
+    if (i != axis) square += v[i] * v[i], along += v[i] * dv[i];
+  dv[axis] = 0;
+  if (!(square > 0)) return;
+  const T speed = std::sqrt(square), left = 1 + friction * normal_speed / speed;
+  const T change = (dfriction * normal_speed + friction * d_normal - friction * normal_speed * along / square) / speed;
+  for (int i = 0; i < D; ++i)
+    if (i != axis) dv[i] = left > 0 ? dv[i] * left + v[i] * change : 0;
+}
+
+// The derivative of `velocities` along (dfrom, dnumbers, dfriction).
+template <class T, int D>
+void velocities_tangent(const Index nodes[D], Index batch, const Walls<D>& walls,
+                        Batched<const T> from, Batched<const T> numbers, Batched<const T> friction,
+                        Batched<const T> dfrom, Batched<const T> dnumbers,
+                        Batched<const T> dfriction, Batched<T> to, Pool& pool) {
+  for_each_member(batch, pool, [&](Index b, Pool& pool) {
+    const T *in = from.at(b), *number = numbers.at(b), *din = dfrom.at(b), *dnumber = dnumbers.at(b);
+    const T kept = number[0], mu = *friction.at(b), dmu = *dfriction.at(b);
+    T* out = to.at(b);
+    for_each_node<D>(nodes, walls, b, pool, [&](Index n, const std::array<int, D>& sides, Index) {
+      const T *node = in + n * kChannels, *dnode = din + n * kChannels;
+      T* dv = out + n * kChannels;
+      const T mass = node[D];
+      for (int i = 0; i < kChannels; ++i) dv[i] = 0;
+      if (mass > 0) {
+        T v[D];
+        for (int i = 0; i < D; ++i) {
+          const T own = node[i] / mass + number[1 + i];
+          v[i] = kept * own;
+          dv[i] = dnumber[0] * own +
+                  kept * ((dnode[i] - node[i] / mass * dnode[D]) / mass + dnumber[1 + i]);
+        }
+        for (int i = 0; i < D; ++i) {
+          if (!sides[i]) continue;
+          touch_tangent<D>(walls.contact, mu, dmu, i, T(-sides[i]), v, dv);
+          touch<D>(walls.contact, mu, i, T(-sides[i]), v);
+        }
       }
+      dv[D] = dnode[D];
     });
   });
 }

@@ -14,6 +14,17 @@ Index each_particle(In& parameter) {
   return parameter.dimensions()[is_batched(parameter, 1)] > 1 ? 1 : 0;
 }
 
+using Sides = ffi::Buffer<ffi::S8>;
+
+// One array of sides for each direction; without walls they are empty.
+Walls<D> walls_of(std::int64_t contact, Sides& x, Sides& y, Sides& z) {
+  Walls<D> walls;
+  walls.contact = Contact(contact);
+  Sides* const all[3] = {&x, &y, &z};
+  for (int i = 0; i < D; ++i) walls.side[i] = shared_or_each(*all[i], 1);
+  return walls;
+}
+
 Sender<T> sender(Mask& alive, Mask& inside, In& xi, In& position, In& mass, In& volume, In& v, In& C,
                  In& He, In& H, In& mu, In& lam, In& numbers) {
   return {shared_or_each(xi, 2),      shared_or_each(position, 2),

@@ -33,14 +33,15 @@ ffi::Error SendPull(ffi::ThreadPool threads, std::int64_t degree, bool mls, std:
   });
 }
 
-ffi::Error VelocitiesPull(ffi::ThreadPool threads, In momentum_and_mass, In numbers, In bar,
-                          Out momentum_and_mass_bar, Out numbers_bar) {
+ffi::Error VelocitiesPull(ffi::ThreadPool threads, std::int64_t contact, Sides x, Sides y, Sides z,
+                          In momentum_and_mass, In numbers, In friction, In bar,
+                          Out momentum_and_mass_bar, Out numbers_bar, Out friction_bar) {
   Pool pool = pool_of(threads);
-  const Index batch = batch_size(*momentum_and_mass_bar, D + 1);
-  const Index nodes = Index(momentum_and_mass_bar->element_count()) / (batch * kChannels);
-  velocities_pull<T, D>(nodes, batch, shared_or_each(momentum_and_mass, D + 1),
-                        shared_or_each(numbers, 1), shared_or_each(bar, D + 1),
-                        each(momentum_and_mass_bar, D + 1), each(numbers_bar, 1), pool);
+  velocities_pull<T, D>(nodes_of(momentum_and_mass).data(), batch_size(*momentum_and_mass_bar, D + 1),
+                        walls_of(contact, x, y, z), shared_or_each(momentum_and_mass, D + 1),
+                        shared_or_each(numbers, 1), shared_or_each(friction, 1),
+                        shared_or_each(bar, D + 1), each(momentum_and_mass_bar, D + 1),
+                        each(numbers_bar, 1), each(friction_bar, 1), pool);
   return ffi::Error::Success();
 }
 
@@ -84,6 +85,9 @@ ffi::Error ReceivePull(ffi::ThreadPool threads, std::int64_t degree, bool mls, s
 #define PGJAX_CALL()                                                                     \
   ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("degree").Attr<bool>("mls") \
       .Attr<std::int64_t>("kind")
+#define PGJAX_WALLS()                                                                          \
+  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("contact").Arg<Sides>().Arg<Sides>() \
+      .Arg<Sides>()
 #define PGJAX_RET Ret<ffi::Buffer<kType>>()
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send_pull, SendPull,
@@ -93,8 +97,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send_pull, SendPull,
                                   .PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET
                                   .PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET.PGJAX_RET);
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_velocities_pull, VelocitiesPull,
-                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Arg<In>().Arg<In>().Arg<In>()
-                                  .PGJAX_RET.PGJAX_RET);
+                              PGJAX_WALLS().Arg<In>().Arg<In>().Arg<In>().Arg<In>()
+                                  .PGJAX_RET.PGJAX_RET.PGJAX_RET);
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_receive_pull, ReceivePull,
                               PGJAX_CALL().Attr<bool>("correct").Arg<Mask>().Arg<Mask>().Arg<Mask>()
                                   .Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()

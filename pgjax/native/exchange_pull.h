@@ -168,46 +168,67 @@ void send_pull(const Shape<D>& shape, Index batch, const Sender<T>& in, Batched<
   });
 }
 
+// The derivative of `touch` at v in reverse mode, in place; returns that of the friction.
+template <int D, class T>
+PGJAX_INLINE T touch_pull(Contact contact, T friction, int axis, T inward, const T v[D], T bar[D]) {
+  const T normal_speed = inward * v[axis];
+  if (contact == kSticky)
+    for (int i = 0; i < D; ++i) bar[i] = 0;
+  if (contact == kSlip) bar[axis] = 0;
+  if (contact != kSeparating || !(normal_speed < 0)) return 0;
+  T square = 0, along = 0;
+  for (int i = 0; i < D; ++i)
+    if (i != axis) square += v[i] * v[i], along += v[i] * bar[i];
+  bar[axis] = 0;
+  if (!(square > 0)) return 0;
+  const T speed = std::sqrt(square), left = 1 + friction * normal_speed / speed;
+  for (int i = 0; i < D; ++i)
+    if (i != axis)
+      bar[i] = left > 0 ? left * bar[i] - along * friction * normal_speed / (speed * square) * v[i] : 0;
+  bar[axis] = left > 0 ? along * friction / speed * inward : 0;
+  return left > 0 ? along * normal_speed / speed : 0;
+}
+
 // From the cotangents of velocity and mass of a node to those of momentum and mass.
 template <class T, int D>
-void velocities_pull(Index nodes, Index batch, Batched<const T> from, Batched<const T> numbers,
-                     Batched<const T> bar, Batched<T> to, Batched<T> numbers_bar, Pool& pool) {
-  constexpr Index kChunk = 1 << 14;
+void velocities_pull(const Index nodes[D], Index batch, const Walls<D>& walls, Batched<const T> from,
+                     Batched<const T> numbers, Batched<const T> friction, Batched<const T> bar,
+                     Batched<T> to, Batched<T> numbers_bar, Batched<T> friction_bar, Pool& pool) {
   for_each_member(batch, pool, [&](Index b, Pool& pool) {
     const T *in = from.at(b), *number = numbers.at(b), *above = bar.at(b);
+    const T kept = number[0], mu = *friction.at(b);
     T* out = to.at(b);
-    Vec<T> gains = {};
-    for (int i = 0; i < D; ++i) gains[i] = number[1 + i];
-    const T kept = number[0];
-    const Index chunks = (nodes + kChunk - 1) / kChunk;
-    Sums<1 + D> sums(chunks);
-    pool.run(chunks, [&](Index chunk) {
-      const Index end = std::min(nodes, (chunk + 1) * kChunk);
-      double through_kept = 0;
-      double through_gains[D] = {};
-      for (Index n = chunk * kChunk; n < end; ++n) {
-        const Vec<T> node = load(in + n * kChannels);
-        Vec<T> v_bar = load(above + n * kChannels);
-        const T mass = node[D], mass_bar = v_bar[D];
-        for (int i = D; i < kChannels; ++i) v_bar[i] = 0;
-        Vec<T> back = {};
-        if (mass > 0) {
-          const Vec<T> v = node / mass;
-          back = v_bar * (kept / mass);
-          const T along = total(back * v);
-          back[D] = mass_bar - along;
-          through_kept += total(v_bar * (v + gains));
-          for (int i = 0; i < D; ++i) through_gains[i] += v_bar[i];
-        } else {
-          back[D] = mass_bar;
-        }
-        store(out + n * kChannels, back);
-      }
+    Sums<2 + D> sums(node_chunks<D>(nodes));
+    for_each_node<D>(nodes, walls, b, pool, [&](Index n, const std::array<int, D>& sides, Index chunk) {
+      const T *node = in + n * kChannels, *given = above + n * kChannels;
+      T* back = out + n * kChannels;
+      const T mass = node[D];
+      for (int i = 0; i < kChannels; ++i) back[i] = 0;
+      back[D] = given[D];
+      if (!(mass > 0)) return;
+      T v[D + 1][D], v_bar[D];
+      for (int i = 0; i < D; ++i) v[0][i] = kept * (node[i] / mass + number[1 + i]), v_bar[i] = given[i];
       double* partial = sums.part(chunk);
-      partial[0] = through_kept;
-      for (int i = 0; i < D; ++i) partial[1 + i] = through_gains[i] * kept;
+      for (int k = 0; k < D; ++k) {
+        for (int i = 0; i < D; ++i) v[k + 1][i] = v[k][i];
+        if (sides[k]) touch<D>(walls.contact, mu, k, T(-sides[k]), v[k + 1]);
+      }
+      for (int k = D - 1; k >= 0; --k)
+        if (sides[k]) partial[1 + D] += touch_pull<D>(walls.contact, mu, k, T(-sides[k]), v[k], v_bar);
+      T along = 0, through_kept = 0;
+      for (int i = 0; i < D; ++i) {
+        back[i] = v_bar[i] * kept / mass;
+        along += back[i] * node[i];
+        through_kept += v_bar[i] * (node[i] / mass + number[1 + i]);
+        partial[1 + i] += double(v_bar[i]) * kept;
+      }
+      back[D] -= along / mass;
+      partial[0] += through_kept;
     });
-    sums.store(numbers_bar.at(b));
+    T total[2 + D];
+    sums.store(total);
+    for (int i = 0; i <= D; ++i) numbers_bar.at(b)[i] = total[i];
+    *friction_bar.at(b) = total[1 + D];
   });
 }
 

@@ -31,6 +31,7 @@ def stage(
     *,
     masks: int = 0,
     batched: bool = False,
+    tangent: Kernel | None = None,
     pull: Kernel | None = None,
 ) -> Callable[..., Arrays]:
     """A function that runs as a native kernel where there is one.
@@ -43,13 +44,14 @@ def stage(
             if any.
         masks: how many of the operands, the first ones, are not floating.
         batched: whether the kernel needs a batch axis, be it of length 1.
+        tangent: the same for `(*operands, *tangents of the floating ones) -> tangents`.
         pull: the same for `(*operands, *cotangents) -> cotangents of the floating operands`.
     """
     forward = _primitive(name, plain, rank, kernel, batched)
     if pull is None:
         ad.primitive_jvps[forward] = _plain_jvp(plain, rank)
     else:
-        ad.primitive_jvps[forward] = _linear_jvp(name, forward, plain, rank, masks, pull)
+        ad.primitive_jvps[forward] = _linear_jvp(name, forward, plain, rank, masks, tangent, pull)
 
     def call(*operands: Array, **static: Any) -> Arrays:
         floats = operands[masks:]
@@ -149,7 +151,8 @@ def _linear_jvp(
     plain: Callable[..., Arrays],
     rank: int,
     masks: int,
-    pull: Kernel,
+    tangent_kernel: Kernel | None,
+    pull_kernel: Kernel,
 ) -> Callable[..., Any]:
     """The derivative as a primitive that is linear in the tangents, and its transpose."""
 
@@ -169,8 +172,8 @@ def _linear_jvp(
         function = floats_of(operands[:masks], **static)
         return jax.vjp(function, *operands[masks:count])[1](operands[count:])
 
-    tangent = _primitive(f"{name}_tangent", along, rank, None)
-    adjoint = _primitive(f"{name}_pull", pulled, rank, pull)
+    tangent = _primitive(f"{name}_tangent", along, rank, tangent_kernel)
+    adjoint = _primitive(f"{name}_pull", pulled, rank, pull_kernel)
     ad.primitive_jvps[adjoint] = _plain_jvp(pulled, rank)
     along_all = _over_batch(along, rank)
 
@@ -204,5 +207,6 @@ def _linear_jvp(
 
     ad.primitive_jvps[tangent] = tangent_jvp
     ad.primitive_transposes[tangent] = transpose
-    batching.primitive_batchers[tangent] = batch
+    if tangent_kernel is None:
+        batching.primitive_batchers[tangent] = batch
     return jvp
