@@ -257,7 +257,6 @@ void receive_pull(const Shape<D>& shape, Index batch, const Receiver<T>& in, boo
   constexpr Index kSize = kGroup<T>;
   constexpr bool kPlastic = Map::kParameters > 0;
   const auto strides = shape.strides();
-  const Index P = shape.particles;
   for_each_member(batch, pool, [&](Index b, Pool& pool) {
     const T *xi = in.xi.at(b), *g = in.g.at(b), *numbers = in.numbers.at(b);
     const T *He = in.He.at(b), *H = in.H.at(b);

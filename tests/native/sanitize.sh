@@ -5,8 +5,10 @@ cd "$(dirname "$0")"
 out=$(mktemp -d)
 trap 'rm -rf "$out"' EXIT
 for kinds in address,undefined thread; do
-    "${CXX:-c++}" -std=c++17 -O1 -g -march=native -Wall -Wextra -Werror \
-        "-fsanitize=$kinds" -fno-sanitize-recover=all -I../../pgjax/native check.cc \
-        -o "$out/check" -pthread
-    echo "$kinds: $("$out/check")"
+    for program in check check_exchange; do
+        "${CXX:-c++}" -std=c++17 -O1 -g -march=native -Wall -Wextra -Werror \
+            "-fsanitize=$kinds" -fno-sanitize-recover=all -I../../pgjax/native "$program.cc" \
+            -o "$out/$program" -pthread
+        echo "$program, $kinds: $("$out/$program")"
+    done
 done
