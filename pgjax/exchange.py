@@ -352,6 +352,17 @@ def _send_native(
     return made[..., : grid.shape[-1]], *rest
 
 
+def _send_tangent(
+    operands: list[Array], types: list[Any], *, law: str, degree: int, mls: bool, **_: Any
+) -> Arrays | None:
+    target = _kernel_of("send_tangent", "exchange_tangent", operands[Sender._fields.index("xi")])
+    if target is None:
+        return None
+    call = jax.ffi.ffi_call(target, _packed_type(types[0]))
+    made = call(*operands, **_attributes(_LAWS.index(law), degree, mls))
+    return (made[..., : types[0].shape[-1]],)
+
+
 def _send_pull(
     operands: list[Array], types: list[Any], *, law: str, degree: int, mls: bool, **_: Any
 ) -> Arrays | None:
@@ -416,6 +427,22 @@ def _receive_native(
     return tuple(call(*given, **_attributes(_map_kind(mapping), degree, mls)))
 
 
+def _receive_tangent(
+    operands: list[Array], types: list[Any], *, mapping: str, degree: int, mls: bool
+) -> Arrays | None:
+    xi = Receiver._fields.index("xi")
+    target = _kernel_of("receive_tangent", "exchange_tangent", operands[xi])
+    if target is None:
+        return None
+    given, at = list(operands), Receiver._fields.index("nodes")
+    # The tangents of the floating operands follow the operands themselves.
+    for i in (at, at + (len(operands) - xi) // 2):
+        given[i] = primitive.with_channels(given[i])
+    correct = np.bool_(mapping.endswith("corrected"))
+    call = jax.ffi.ffi_call(target, types)
+    return tuple(call(*given, correct=correct, **_attributes(_map_kind(mapping), degree, mls)))
+
+
 def _receive_pull(
     operands: list[Array], types: list[Any], *, mapping: str, degree: int, mls: bool, **_: Any
 ) -> Arrays | None:
@@ -433,7 +460,15 @@ def _receive_pull(
     return tuple(b[..., :channels] if i == at - masks else b for i, b in enumerate(bars))
 
 
-_send = stage("send", _send_plain, 1, _send_native, masks=2, pull=_send_pull)
+_send = stage(
+    "send",
+    _send_plain,
+    1,
+    _send_native,
+    masks=2,
+    tangent=_send_tangent,
+    pull=_send_pull,
+)
 _velocities = stage(
     "velocities",
     _velocities_plain,
@@ -443,7 +478,15 @@ _velocities = stage(
     tangent=_velocities_tangent,
     pull=_velocities_pull,
 )
-_receive = stage("receive", _receive_plain, 1, _receive_native, masks=3, pull=_receive_pull)
+_receive = stage(
+    "receive",
+    _receive_plain,
+    1,
+    _receive_native,
+    masks=3,
+    tangent=_receive_tangent,
+    pull=_receive_pull,
+)
 
 
 def send_natively(

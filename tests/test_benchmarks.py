@@ -25,7 +25,8 @@ def test_quick_speed_table_is_whole():
     assert all(values for values in numbers.values()), run.stdout
     assert all(math.isfinite(v) and v > 0 for values in numbers.values() for v in values)
     measured = " ".join(numbers)
-    for part in ("forward", "stage: P2G", "stage: G2P", "compilation", "memory", "gradient"):
+    parts = ("forward", "stage: stress and P2G", "stage: G2P and update", "compilation")
+    for part in (*parts, "memory", "gradient"):
         assert part in measured, run.stderr
     for mode in ("reverse mode", "forward mode"):
         (error,) = next(v for name, v in numbers.items() if name.startswith(mode))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from render_scenes import floats, hard_scene, looking
 
 from pgjax.render import (
     RULE_3DGS,
@@ -12,6 +13,7 @@ from pgjax.render import (
     Camera,
     Gaussians,
     Rule,
+    compositing,
     deform,
     rasterize,
     render,
@@ -26,10 +28,6 @@ RULES = {
     "nostop99": Rule(stop=0),
     "nostop": RULE_EXACT,
 }
-
-
-def floats(array):
-    return jnp.asarray(array, dtype=jnp.zeros(()).dtype)
 
 
 def assert_close(actual, expected, *, tight=1e-6, scale=1.0):
@@ -69,32 +67,6 @@ def test_matches_the_reference_renders(reference_data, name):
             np.testing.assert_allclose(image.depth[seen], expected[seen], rtol=1e-3)
 
 
-def hard_scene(seed, n=96):
-    """Behind, at the near plane, outside, huge, needles, tiny, clear, opaque, tied in depth."""
-    rng = np.random.default_rng(seed)
-    means = rng.uniform([-1.5, -1.5, 2], [1.5, 1.5, 5], (n, 3))
-    scales = np.exp(rng.uniform(np.log(0.01), np.log(0.3), (n, 3)))
-    opacities = rng.uniform(0, 1, n)
-    means[:8, 2] = rng.uniform(-3, 0.0, 8)
-    means[8:12, 2] = [0.01, 0.0100001, 0.02, 0.1]
-    means[12:20] *= [6, 6, 1]
-    scales[20:24] = 30.0
-    scales[24:32] = [2.0, 1e-3, 1e-3]
-    scales[32:40] = 1e-8
-    opacities[40:44] = [0, 1 / 256, 1 / 254, 1e-9]
-    opacities[44:56] = 1.0
-    means[56:72, 2] = 3.0
-    opacities[20:24] = 0.05
-    quaternions, sh = rng.normal(size=(n, 4)), 0.4 * rng.normal(size=(n, 16, 3))
-    return Gaussians.from_scales(*map(floats, (means, quaternions, scales, opacities, sh)))
-
-
-def looking(width, height, focal=45.0):
-    return Camera.look_at(
-        [0, 0, 0], [0, 0, 1], up=[0, -1, 0], focal=focal, width=width, height=height
-    )
-
-
 def assert_matches_oracle(gaussians, camera, **options):
     image = render(gaussians, camera, **options)
     rgb, alpha, depth_acc = render_reference(gaussians, camera, **options)
@@ -125,14 +97,17 @@ def test_large_images_match_the_oracle():
     assert_matches_oracle(hard_scene(7), camera)
 
 
-def test_runs_longer_than_a_batch_and_bands_change_nothing(monkeypatch):
+def test_runs_longer_than_an_item_and_a_batch_change_nothing(monkeypatch):
+    """In plain JAX, whose lists are cut into pieces."""
     scene, camera = hard_scene(3), looking(45, 33)
     expected = render(scene, camera)
-    monkeypatch.setattr(rasterize, "_BATCH", 8)
-    monkeypatch.setattr(rasterize, "_ITEM", 4)
-    monkeypatch.setattr(tiles, "_MAX_PAIRS", 300)
+    monkeypatch.setenv("PGJAX_NATIVE", "0")
+    monkeypatch.setattr(compositing, "_PIXELS", 8 * 64)
+    monkeypatch.setattr(compositing, "_ITEM", 4)
+    jax.clear_caches()
     eps = float(jnp.finfo(expected.rgb.dtype).eps)
     np.testing.assert_allclose(render(scene, camera).rgb, expected.rgb, atol=100 * eps)
+    jax.clear_caches()
 
 
 def test_thousands_of_gaussians_on_one_pixel():
@@ -171,48 +146,44 @@ def test_gaussians_that_are_not_finite_are_counted_and_left_out():
 def test_new_positions_views_and_rules_do_not_recompile():
     scene = hard_scene(0)
     render(scene, looking(45, 33))
-    compiled = rasterize._project._cache_size(), rasterize._composite_items._cache_size()
+    compiled = rasterize._render._cache_size()
     F = jnp.broadcast_to(jnp.eye(3, dtype=scene.means.dtype) * 1.1, scene.factors.shape)
     render(deform(scene, scene.means + 0.1, F), looking(45, 33, focal=50.0), rule=RULE_GSPLAT15)
-    assert compiled == (rasterize._project._cache_size(), rasterize._composite_items._cache_size())
+    assert compiled == rasterize._render._cache_size()
 
 
 def test_tiles_are_complete_and_tight():
     rng = np.random.default_rng(1)
-    n, tile, columns, rows = 200, 8, 7, 5
+    n, grid = 200, tiles.TileGrid(8, 7, 5)
     center = rng.uniform([-20, -20], [76, 60], (n, 2))
     L = np.exp(rng.uniform(0, 3, (n, 2, 1))) * rng.normal(size=(n, 2, 2))
     A = L @ L.transpose(0, 2, 1) + 0.3 * np.eye(2)
     reach = rng.uniform(0.01, 5.5, n)
-    spans = tiles.tile_spans(
-        center,
-        np.stack([A[:, 0, 0], A[:, 1, 1]], axis=-1),
-        A[:, 0, 1],
-        np.linalg.det(A),
-        reach,
-        tile=tile,
-        columns=columns,
-        rows=rows,
-    )
-    listed = {
-        pair
-        for splat, number in tiles.pairs(spans, columns=columns, rows=rows)
-        for pair in zip(splat, number, strict=True)
-    }
-    y, x = np.mgrid[: rows * tile, : columns * tile] + 0.5
+    yy = A[:, 1, 1]
+    form = [A[:, 0, 1] / yy, yy / (2 * np.linalg.det(A)), 1 / (2 * yy), np.ones(n)]
+    shape, reach = floats(np.stack([*center.T, *form], axis=-1)), floats(reach)
+    needed = int(tiles.count_pairs(shape, reach, grid))
+    number, splat = (np.asarray(a) for a in tiles.list_pairs(shape, reach, grid, needed + 8))
+    assert np.all(np.diff(number) >= 0)
+    listed = set(zip(splat[splat < n], number[splat < n], strict=True))
+    y, x = np.mgrid[: grid.rows * 8, : grid.columns * 8] + 0.5
     d = np.stack([x, y], axis=-1) - center[:, None, None]
     sigma = 0.5 * np.einsum("nhwi,nij,nhwj->nhw", d, np.linalg.inv(A), d)
-    inside = (sigma <= reach[:, None, None]).reshape(n, rows, tile, columns, tile)
-    touched = np.argwhere(inside.any(axis=(2, 4)).reshape(n, rows * columns))
+    inside = (sigma <= np.asarray(reach)[:, None, None]).reshape(n, grid.rows, 8, grid.columns, 8)
+    touched = np.argwhere(inside.any(axis=(2, 4)).reshape(n, grid.count))
     assert len(touched) > 900
     assert {tuple(pair) for pair in touched} <= listed
     # The rest are ellipses that pass between pixel centres.
     assert len(listed) < 1.05 * len(touched)
+    assert len(listed) <= needed
 
 
-@pytest.mark.parametrize("options", [{"alpha_max": 1.0}, {"alpha_min": 0}, {"stop": 1}])
+@pytest.mark.parametrize(
+    "options",
+    [{"alpha_max": 1.0}, {"alpha_min": 0}, {"stop": 1}, {"smooth": True, "alpha_min": 0.6}],
+)
 def test_rules_are_checked(options):
-    (name,) = options
+    name = next(iter(options))
     with pytest.raises(ValueError, match=f"Argument `{name}` must"):
         Rule(**options)
 

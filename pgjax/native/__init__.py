@@ -32,10 +32,12 @@ from pgjax._types import Array
 # What each source holds.
 HANDLERS = {
     "exchange": ("send", "velocities", "velocities_tangent", "receive"),
+    "exchange_tangent": ("send_tangent", "receive_tangent"),
     "exchange_pull": ("send_pull", "velocities_pull", "receive_pull"),
     "transfer": ("scatter", "scatter_tangent", "gather", "gather_tangent", "pull"),
     "eigen": ("eigenbasis", "svd"),
     "laws": ("neo_hookean", "fixed_corotated", "stvk_hencky", "von_mises", "drucker_prager"),
+    "raster": ("composite", "composite_tangent", "composite_adjoint"),
 }
 _OPTIONS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fPIC", "-shared")
 _COMPILERS = ("c++", "g++", "clang++")

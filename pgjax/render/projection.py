@@ -58,35 +58,46 @@ def _project_one(g: Gaussians, camera: Camera, low_pass: Scalar, antialiased: bo
 
     The 2×2 covariance is `T Tᵀ + low_pass I` with `T = J W M`. With the rows t₀, t₁ of T its
     determinant is `|t₀ × t₁|² + low_pass (|t₀|² + |t₁|²) + low_pass²`, free of cancellation.
+
+    What is not drawn is replaced before it is used, so that its derivatives are 0 rather than NaN.
     """
     W = camera.world_to_camera[:3, :3]
-    mean = W @ g.means + camera.world_to_camera[:3, 3]
+    finite = _all_finite(g.means, g.factors, g.opacities, g.sh, g.frames)
+    means, factors, sh = (jnp.where(finite, a, 0) for a in (g.means, g.factors, g.sh))
+    frames = jnp.where(finite, g.frames, jnp.eye(3, dtype=g.frames.dtype))
+    mean = W @ means + camera.world_to_camera[:3, 3]
     in_front = mean[2] > camera.near
     mean = jnp.where(in_front, mean, jnp.ones_like(mean))
     X, Y, Z = mean
-    t0, t1 = jacobian(mean, camera) @ (W @ g.factors)
+    T = jacobian(mean, camera) @ (W @ factors)
+    center = jnp.stack([camera.fx * X / Z + camera.cx, camera.fy * Y / Z + camera.cy])
+    color = view_color(sh, frames, means - camera.position)
+    # The determinant is of the fourth order in T.
+    fits = jnp.all(jnp.abs(T) < jnp.finfo(T.dtype).max ** 0.2)
+    finite = finite & fits & _all_finite(center, color)
+    t0, t1 = jnp.where(finite, T, 0)
     area = jnp.cross(t0, t1)
     det_sharp = area @ area
     xx, yy, xy = t0 @ t0, t1 @ t1, t0 @ t1
     det = det_sharp + low_pass * (xx + yy) + low_pass * low_pass
-    color = view_color(g.sh, g.frames, g.means - camera.position)
-    opacity = g.opacities
+    opacity = jnp.where(in_front & finite, g.opacities, 0)
     if antialiased:
         floor = _MIN_COMPENSATION**2
         opacity = opacity * jnp.sqrt(jnp.maximum(det_sharp / det, floor))
-    center = jnp.stack([camera.fx * X / Z + camera.cx, camera.fy * Y / Z + camera.cy])
-    parts = (g.means, g.factors, g.opacities, color, g.frames, det, center)
-    finite = jnp.stack([jnp.all(jnp.isfinite(part)) for part in parts]).all()
     return Splat(
-        center=center,
+        center=jnp.where(finite, center, 0),
         variances=jnp.stack([xx, yy]) + low_pass,
         covariance=xy,
         det=det,
-        opacity=jnp.where(in_front & finite, opacity, 0),
-        color=color,
+        opacity=opacity,
+        color=jnp.where(finite, color, 0),
         depth=Z,
         finite=finite,
     )
+
+
+def _all_finite(*parts: Array) -> Array:
+    return jnp.stack([jnp.all(jnp.isfinite(part)) for part in parts]).all()
 
 
 def jacobian(mean: Vector3, camera: Camera) -> Float[Array, "2 3"]:
@@ -115,6 +126,7 @@ def _clamped(ratio: Scalar, center: Scalar, focal: Scalar, size: int) -> Scalar:
 def view_color(sh: Float[Array, "k 3"], frame: Matrix3, offset: Vector3) -> Vector3:
     """`max(Y(Bᵀ d) · c + 1/2, 0)` with d along `offset`, from the camera to the mean."""
     degree = int(sh.shape[0] ** 0.5) - 1
-    length = jnp.sqrt(offset @ offset)
-    direction = offset / jnp.where(length > 0, length, 1)
+    square = offset @ offset
+    # No direction, and no derivative of it, where the camera is in the centre.
+    direction = offset / jnp.sqrt(jnp.where(square > 0, square, 1))
     return jnp.maximum(harmonics(frame.T @ direction, degree) @ sh + 0.5, 0)

@@ -29,6 +29,9 @@ def render_reference(
         sigma = 0.5 * np.einsum("hwi,ij,hwj->hw", d, np.linalg.inv(A), d)
         alpha = np.minimum(rule.alpha_max, opacity * np.exp(-sigma))
         drawn = running & (sigma >= 0) & (alpha >= rule.alpha_min)
+        if rule.smooth:
+            t = np.clip(alpha / rule.alpha_min - 1, 0, 1)
+            alpha = alpha * t * t * (3 - 2 * t)
         running &= ~(drawn & (T * (1 - alpha) <= rule.stop))
         drawn &= running
         weight = np.where(drawn, T * alpha, 0)

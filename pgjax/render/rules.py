@@ -18,12 +18,16 @@ class Rule(eqx.Module):
         alpha_min: smallest alpha that is drawn.
         stop: transmittance at which a ray ends; 0 for never.
         low_pass: added to the variances in the image, in squared pixels.
+        smooth: instead of the jump at alpha_min, multiply alpha by `t² (3 − 2 t)` with
+            `t = alpha / alpha_min − 1` between alpha_min and twice that: the image is then a
+            continuously differentiable function of what is drawn, up to the order in depth.
     """
 
     alpha_max: float = eqx.field(default=0.99, static=True, converter=float)
     alpha_min: float = eqx.field(default=1 / 255, static=True, converter=float)
     stop: float = eqx.field(default=1e-4, static=True, converter=float)
     low_pass: float = eqx.field(default=0.3, static=True, converter=float)
+    smooth: bool = eqx.field(default=False, static=True, converter=bool)
 
     def __check_init__(self):
         bounds = {
@@ -31,6 +35,10 @@ class Rule(eqx.Module):
             "alpha_min": (0 < self.alpha_min < 1, "be between 0 and 1 (excluded)"),
             "stop": (0 <= self.stop < 1, "be in [0, 1)"),
             "low_pass": (self.low_pass > 0, "be positive"),
+            "smooth": (
+                not self.smooth or 2 * self.alpha_min <= self.alpha_max,
+                "be False unless alpha_min is at most alpha_max / 2",
+            ),
         }
         for name, (holds, rule) in bounds.items():
             if not holds:

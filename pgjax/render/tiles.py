@@ -1,128 +1,163 @@
-"""Which splats touch which tiles of the image: exact lists, made on the host.
+"""Which splats touch which tiles of the image, as lists of a fixed length, in plain JAX.
 
-A splat is drawn where `σ ≤ s = log(opacity / alpha_min)`, an ellipse. With the covariance
-`[[xx, xy], [xy, yy]]`, `m = xy / yy` and `det = xx yy − xy²`,
-
-    2 σ = (dx − m dy)² yy / det + dy² / yy,
-
-so on one pixel row the ellipse is an interval, and over the rows of a tile the union of intervals.
+A splat is drawn where `σ = p (dx − m dy)² + q dy²` is at most `s = log(opacity / alpha_min)`, an
+ellipse: on one pixel row an interval, over the rows of a tile a union of intervals.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import final
 
-import numpy as np
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 
-# Pairs (splat, tile) held at once; an image that needs more is drawn in bands of tile rows.
-_MAX_PAIRS = 1_000_000
+from pgjax import native
+from pgjax._types import Array, Bool, Float, Int
 
-
-class Spans(NamedTuple):
-    """Runs of tiles [first, last] in one tile row that one splat touches; sorted by row."""
-
-    splat: np.ndarray
-    row: np.ndarray
-    first: np.ndarray
-    last: np.ndarray
+_SMALL_IMAGE = 400
 
 
-def tile_spans(
-    center: np.ndarray,
-    variances: np.ndarray,
-    covariance: np.ndarray,
-    det: np.ndarray,
-    reach: np.ndarray,
-    *,
-    tile: int,
-    columns: int,
-    rows: int,
-) -> Spans:
-    """The spans of splats that are given front to back; `reach` is s > 0.
+@final
+class TileGrid(eqx.Module):
+    """The tiles of an image, numbered row by row.
 
-    Within a row of tiles the splats stay in the given order. All arrays are float64.
+    Attributes:
+        tile: width of a tile in pixels.
+        columns: tiles side by side.
+        rows: tiles on top of each other.
     """
-    # Rounding in single precision moves σ and the centre by far less than this.
-    reach = reach * (1 + 1e-3) + 1e-3
-    (u, v), (xx, yy) = center.T, variances.T
-    # Pixel centres of tile row i lie at i·tile + 1/2 … i·tile + tile − 1/2.
-    half_height = np.sqrt(2 * reach * yy) + 0.01
-    top = _first_tile(v - half_height, tile, rows)
-    bottom = _last_tile(v + half_height, tile, rows)
-    splat, row = _expand(top, np.maximum(bottom - top + 1, 0))
 
-    u, v, xx, yy = u[splat], v[splat], xx[splat], yy[splat]
-    xy, det, reach = covariance[splat], det[splat], reach[splat]
-    low = row * tile + 0.5 - v
-    limit = np.sqrt(2 * reach * yy)
-    high = np.minimum(low + (tile - 1), limit)
-    low = np.maximum(np.minimum(low, limit), -limit)
-    high = np.maximum(high, -limit)
+    tile: int = eqx.field(static=True)
+    columns: int = eqx.field(static=True)
+    rows: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, width: int, height: int) -> "TileGrid":
+        """Tiles of 8² pixels in small images, where they halve the work, else of 16²."""
+        tile = 8 if max(width, height) < _SMALL_IMAGE else 16
+        return cls(tile, -(-width // tile), -(-height // tile))
+
+    @property
+    def count(self) -> int:
+        """How many tiles there are."""
+        return self.columns * self.rows
+
+    def first(self, low: Array, count: int) -> Array:
+        """First tile with a pixel centre at or above `low`, between 0 and count."""
+        return jnp.clip(jnp.ceil((low + 0.5) / self.tile - 1), 0, count).astype(jnp.int32)
+
+    def last(self, high: Array, count: int) -> Array:
+        """Last tile with a pixel centre at or below `high`, between −1 and count − 1."""
+        return jnp.clip(jnp.floor((high - 0.5) / self.tile), -1, count - 1).astype(jnp.int32)
+
+
+def row_range(
+    shape: Float[Array, "n 6"], reach: Float[Array, " n"], grid: TileGrid
+) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
+    """First and last row of tiles that each splat may touch; none where its reach is negative."""
+    v, q = shape[:, 1], shape[:, 4]
+    half_height = jnp.sqrt(_enlarged(reach) / q) + _margin(v)
+    top = grid.first(v - half_height, grid.rows)
+    bottom = grid.last(v + half_height, grid.rows)
+    return top, jnp.where(reach >= 0, bottom, top - 1)
+
+
+def columns_in_row(
+    shape: Float[Array, "n 6"], reach: Float[Array, " n"], row: Int[Array, " n"], grid: TileGrid
+) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
+    """First tile, and how many side by side, that each splat touches in its row of tiles."""
+    u, v, m, p, q = shape[:, :5].T
+    reach = _enlarged(reach)
+    limit = jnp.sqrt(reach / q)
+    row_top = (row * grid.tile).astype(v.dtype) + 0.5
+    low = jnp.clip(row_top - v, -limit, limit)
+    high = jnp.clip(row_top + (grid.tile - 1) - v, -limit, limit)
     # The rightmost point of the ellipse lies at dy = turn, the leftmost at −turn.
-    turn = xy * np.sqrt(2 * reach / xx)
+    turn = m / q * jnp.sqrt(reach / (1 / p + m * m / q))
 
-    def edge(sign: int) -> np.ndarray:
-        dy = np.clip(sign * turn, low, high)
-        width = np.sqrt(np.maximum(2 * reach - dy * dy / yy, 0) * det / yy)
-        return u + xy / yy * dy + sign * (width + 0.01)
+    def edge(sign: int) -> Array:
+        dy = jnp.clip(sign * turn, low, high)
+        width = jnp.sqrt(jnp.maximum(reach - q * dy * dy, 0) / p)
+        return u + m * dy + sign * (width + _margin(u) + _margin(m * dy))
 
-    first = _first_tile(edge(-1), tile, columns)
-    last = _last_tile(edge(+1), tile, columns)
-    kept = np.flatnonzero(last >= first)
-    kept = kept[np.argsort(_small(row[kept]), kind="stable")]
-    return Spans(splat[kept], row[kept], first[kept], last[kept])
+    first, last = grid.first(edge(-1), grid.columns), grid.last(edge(+1), grid.columns)
+    return first, jnp.maximum(last - first + 1, 0)
 
 
-def pairs(spans: Spans, *, columns: int, rows: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs (splat, tile), sorted by tile and front to back within, in bands of whole tile rows.
+def _enlarged(reach: Array) -> Array:
+    """Rounding in single precision moves σ by far less than this."""
+    return jnp.maximum(reach, 0) * (1 + 1e-3) + 1e-3
 
-    Tiles are numbered row by row. A band holds about a million pairs at most, or one tile row.
+
+def _margin(position: Array) -> Array:
+    """In pixels; far outside of the image positions are rounded."""
+    return 0.01 + 4 * jnp.finfo(position.dtype).eps * jnp.abs(position)
+
+
+def count_pairs(
+    shape: Float[Array, "n 6"], reach: Float[Array, " n"], grid: TileGrid
+) -> Int[Array, ""]:
+    """Length of the lists that `list_pairs` needs (2³⁰ stands for that and more)."""
+    top, bottom = row_range(shape, reach, grid)
+
+    def add(total: Array, row: Array) -> tuple[Array, None]:
+        count = columns_in_row(shape, reach, jnp.broadcast_to(row, top.shape), grid)[1]
+        return total + _total(jnp.where((row >= top) & (row <= bottom), count, 0)), None
+
+    _, zero = native.varying(reach, jnp.zeros(()))
+    pairs, _ = jax.lax.scan(add, zero, jnp.arange(grid.rows, dtype=jnp.int32))
+    needed = jnp.maximum(pairs, _total(bottom - top + 1))
+    # In floating-point numbers, which do not wrap around; one part in 10⁶ is their rounding.
+    needed = jnp.where(needed > 2**22, needed * (1 + 1e-6) + 1, needed)
+    return jnp.clip(needed, 0, 2**30).astype(jnp.int32)
+
+
+def _total(counts: Int[Array, " n"]) -> Float[Array, ""]:
+    return jnp.sum(counts.astype(jnp.zeros(()).dtype))
+
+
+def list_pairs(
+    shape: Float[Array, "n 6"], reach: Float[Array, " n"], grid: TileGrid, capacity: int
+) -> tuple[Int[Array, " c"], Int[Array, " c"]]:
+    """The pairs (tile, splat), sorted by tile and in the order of the splats within.
+
+    Entries beyond the last pair have the tile `grid.count` and the splat n. Lists that are too
+    short for what `count_pairs` says are cut off.
     """
-    count = spans.last - spans.first + 1
-    per_row = np.bincount(spans.row, weights=count, minlength=rows)
-    starts = np.searchsorted(spans.row, np.arange(rows + 1))
-    begin = 0
-    while begin < rows:
-        end, total = begin + 1, per_row[begin]
-        while end < rows and total + per_row[end] <= _MAX_PAIRS:
-            total += per_row[end]
-            end += 1
-        band = slice(starts[begin], starts[end])
-        index, column = _expand(spans.first[band], count[band])
-        tile = spans.row[band][index] * columns + column
-        order = np.argsort(_small(tile - begin * columns), kind="stable")
-        yield spans.splat[band][index][order], tile[order]
-        begin = end
+    n = shape.shape[0]
+    top, bottom = row_range(shape, reach, grid)
+    splat, below, used = _expanded(bottom - top + 1, capacity)
+    row = top[splat] + below
+    first, count = columns_in_row(shape[splat], reach[splat], row, grid)
+    span, beside, used = _expanded(jnp.where(used, count, 0), capacity)
+    tile = jnp.where(used, row[span] * grid.columns + first[span] + beside, grid.count)
+    splat = jnp.where(used, splat[span], n)
+    tile, splat = jax.lax.sort((tile, splat), num_keys=1, is_stable=True)
+    return tile, splat
 
 
-def work_items(tile: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut each tile's run of pairs into items of at most `size` pairs.
+def work_items(
+    tile: Int[Array, " c"], grid: TileGrid, size: int, number: int
+) -> tuple[Int[Array, " i"], Int[Array, "i size"]]:
+    """Cut each tile's run of pairs into items of at most `size`.
 
-    Returns the tile of each item, and where in the list of pairs it begins and ends.
+    Returns the tile of each item, and the places of its pairs in the list (c where there is none).
+    `number` items suffice if it is at least c / size + the number of tiles.
     """
-    bounds = np.flatnonzero(np.diff(tile, prepend=-1, append=-1))
-    lengths = np.diff(bounds)
-    run, piece = _expand(np.zeros_like(lengths), -(-lengths // size))
-    begin = bounds[:-1][run] + piece * size
-    return tile[begin], begin, np.minimum(begin + size, bounds[1:][run])
+    c = tile.shape[0]
+    begin = jnp.searchsorted(tile, jnp.arange(grid.count + 1, dtype=jnp.int32)).astype(jnp.int32)
+    owner, piece, used = _expanded(-(-jnp.diff(begin) // size), number)
+    index = begin[owner, None] + size * piece[:, None] + jnp.arange(size, dtype=jnp.int32)[None]
+    inside = (index < begin[owner + 1, None]) & used[:, None]
+    return jnp.where(used, owner, grid.count), jnp.where(inside, index, c)
 
 
-def _first_tile(low: np.ndarray, tile: int, count: int) -> np.ndarray:
-    """First tile with a pixel centre at or above `low`, between 0 and count."""
-    return np.clip(np.ceil((low + 0.5) / tile - 1), 0, count).astype(np.int64)
-
-
-def _last_tile(high: np.ndarray, tile: int, count: int) -> np.ndarray:
-    """Last tile with a pixel centre at or below `high`, between −1 and count − 1."""
-    return np.clip(np.floor((high - 0.5) / tile), -1, count - 1).astype(np.int64)
-
-
-def _expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each i count[i] times, beside count[i] successive numbers from first[i]."""
-    index = np.repeat(np.arange(len(count)), count)
-    begins = np.cumsum(count) - count
-    return index, np.arange(len(index)) - np.repeat(begins - first, count)
-
-
-def _small(keys: np.ndarray) -> np.ndarray:
-    """The keys in 16 bits where they fit: numpy then sorts them by radix, ten times faster."""
-    return keys.astype(np.uint16) if keys.size and keys.max() < 2**16 else keys
+def _expanded(
+    count: Int[Array, " n"], length: int
+) -> tuple[Int[Array, " length"], Int[Array, " length"], Bool[Array, " length"]]:
+    """Each i count[i] times, beside 0 … count[i] − 1, and which entries are in use."""
+    end = jnp.cumsum(count, dtype=jnp.int32)
+    place = jnp.arange(length, dtype=jnp.int32)
+    index = jnp.searchsorted(end, place, side="right", method="sort").astype(jnp.int32)
+    used = index < count.shape[0]
+    index = jnp.minimum(index, count.shape[0] - 1)
+    return index, jnp.where(used, place - (end - count)[index], 0), used

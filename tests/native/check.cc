@@ -7,6 +7,7 @@
 
 #include "eigen.h"
 #include "laws.h"
+#include "raster.h"
 #include "threads.h"
 
 namespace {
@@ -153,11 +154,81 @@ bool check_laws() {
          check_law<T>(drucker_prager<V>);
 }
 
+// Images, tangents and cotangents of splats of which some are no numbers, lie far outside, or cover
+// everything: finite, and the same with more threads. Sizes that do not fill the last tiles.
+template <class T>
+Numbers<T> run_raster(Index count, Index channels, const raster::Frame& frame, bool smooth,
+                      Pool& pool) {
+  std::mt19937 random(11);
+  std::normal_distribution<T> normal;
+  std::uniform_real_distribution<T> unit(0, 1);
+  const auto drawn = [&](Index n) {
+    Numbers<T> a(n);
+    for (T& v : a) v = normal(random);
+    return a;
+  };
+  Numbers<T> shape(count * raster::kShape), key(count);
+  for (Index i = 0; i < count; ++i) {
+    T* s = &shape[i * raster::kShape];
+    s[0] = frame.width * (2 * unit(random) - T(0.5)), s[1] = frame.height * (2 * unit(random) - T(0.5));
+    s[2] = normal(random), s[3] = std::exp(2 * normal(random) - 4);
+    s[4] = std::exp(2 * normal(random) - 4), s[5] = i % 5 ? unit(random) : T(1);
+    const T bad[] = {T(NAN), T(INFINITY), T(-INFINITY), T(1e30), T(-1e30), T(0), T(1e-30)};
+    if (i % 13 == 4) s[i / 13 % 6] = bad[i / 13 % 7];
+    key[i] = i % 17 == 3 ? T(NAN) : std::floor(8 * normal(random));
+  }
+  const Index pixels = Index(frame.width) * frame.height, tangents = 3;
+  const auto values = drawn(count * channels);
+  const auto dshape = drawn(tangents * shape.size()), dvalues = drawn(tangents * values.size());
+  const auto gsums = drawn(pixels * channels), gcover = drawn(pixels);
+  const raster::Splats<T> splats{count, channels, shape.data(), values.data(), key.data()};
+  const raster::Rule<T> rule{T(0.99), T(1) / 255, smooth ? T(0) : T(1e-4), smooth};
+  const raster::Lists<T> lists(splats, frame, rule, pool);
+  Numbers<T> all;
+  const auto keep = [&](const Numbers<T>& v) { all.insert(all.end(), v.begin(), v.end()); };
+  Numbers<T> sums(tangents * pixels * channels), cover(tangents * pixels);
+  raster::composite(lists, rule, sums.data(), cover.data(), pool);
+  keep(sums), keep(cover);
+  raster::tangent(lists, rule, tangents, count, dshape.data(), dvalues.data(), sums.data(),
+                  cover.data(), pool);
+  keep(sums), keep(cover);
+  Numbers<T> bar_shape(shape.size()), bar_values(values.size());
+  raster::adjoint(lists, rule, gsums.data(), gcover.data(), bar_shape.data(), bar_values.data(),
+                  pool);
+  keep(bar_shape), keep(bar_values);
+  return all;
+}
+
+template <class T>
+bool check_raster(Index count, Index channels, const raster::Frame& frame, bool smooth) {
+  Pool alone;
+  const auto expected = run_raster<T>(count, channels, frame, smooth, alone);
+  for (T v : expected)
+    if (!std::isfinite(v)) return std::printf("an image is not finite\n"), false;
+  for (int threads : {2, 3, 8}) {
+    Threads more(threads - 1);
+    Pool pool = more.pool();
+    const auto got = run_raster<T>(count, channels, frame, smooth, pool);
+    if (got.size() != expected.size() ||
+        std::memcmp(got.data(), expected.data(), got.size() * sizeof(T)))
+      return std::printf("%d threads make another image\n", threads), false;
+  }
+  return true;
+}
+
+template <class T>
+bool check_raster() {
+  return check_raster<T>(0, 4, {20, 9}, false) && check_raster<T>(1, 4, {1, 1}, true) &&
+         check_raster<T>(5000, 4, {65, 31}, false) && check_raster<T>(600, 7, {33, 17}, true) &&
+         check_raster<T>(600, 0, {8, 16}, false);
+}
+
 }  // namespace
 
 int main() {
   const bool good = check_eigen<float>() && check_eigen<double>() && check_laws<float>() &&
-                    check_laws<double>() && check_dimension<float, 2>() &&
+                    check_laws<double>() && check_raster<float>() && check_raster<double>() &&
+                    check_dimension<float, 2>() &&
                     check_dimension<float, 3>() &&
                     check_dimension<double, 2>() && check_dimension<double, 3>();
   std::puts(good ? "equal" : "FAILED");

@@ -5,6 +5,7 @@
 #include <random>
 
 #include "exchange_pull.h"
+#include "exchange_tangent.h"
 #include "threads.h"
 
 namespace {
@@ -71,6 +72,20 @@ Numbers<T> run(const Arrays<T, D>& a, Pool pool) {
   for (char x : finite) all.push_back(x);
   for (Count x : events) all.push_back(T(x));
 
+  // Along what is there itself, the numbers that are not finite put away.
+  const auto tame = [](Numbers<T> x) {
+    for (T& e : x) e = std::isfinite(e) && std::fabs(e) < 1e6 ? e : T(1);
+    return x;
+  };
+  const auto dxi = tame(a.xi), dHe = tame(a.He);
+  const Sender<T> along{each(dxi),    each(dxi),       each(a.v),       each(a.C),
+                        each(dHe),    each(a.H),       a.mask(a.alive), a.mask(a.inside),
+                        each(a.mass), each(a.volume),  shared(a.numbers), {each(a.second), each(a.third)},
+                        {1, 1},       true};
+  Numbers<T> dg(g.size());
+  send_tangent<T, D, K, Mls, Law<T>>(a.shape, kBatch, sender, along, made(dg), pool);
+  keep(dg);
+
   Walls<D> walls;
   walls.contact = kSeparating;
   std::vector<std::int8_t> sides(40, 0);
@@ -102,6 +117,13 @@ Numbers<T> run(const Arrays<T, D>& a, Pool pool) {
                              {each(a.first), each(a.second), each(a.third)}, {1, 1, 1}};
   receive<T, D, K, Mls, Map>(a.shape, kBatch, receiver,
                              {made(x), made(new_v), made(C), made(He), made(H), made(first)}, pool);
+  for (const auto* made : {&x, &new_v, &C, &He, &H, &first}) keep(*made);
+  const Receiver<T> moved{each(dxi), each(g),   each(dxi), each(a.v), each(a.C), each(dHe), each(a.H),
+                          Arrays<T, D>::mask(alive), Arrays<T, D>::mask(finite), a.mask(a.held),
+                          shared(a.numbers), {each(a.first), each(a.second), each(a.third)}, {1, 1, 1}};
+  receive_tangent<T, D, K, Mls, Map>(
+      a.shape, kBatch, receiver, moved, true,
+      {made(x), made(new_v), made(C), made(He), made(H), made(first)}, pool);
   for (const auto* made : {&x, &new_v, &C, &He, &H, &first}) keep(*made);
   const ReceivedBars<T> bars{each(a.v), each(a.v), each(C), each(He), each(H), each(a.mass)};
   Numbers<T> C_bar(C.size()), He_bar(He.size()), H_bar(H.size());
