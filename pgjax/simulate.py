@@ -87,8 +87,8 @@ def simulate(
         throw: raise `SimulationError` when a particle was masked. Inside `jit`, `grad` or `vmap`
             nothing can be raised: look at `trajectory.status`.
         allow_unstable: accept a time step above the stable one.
-        keep_states: reverse mode keeps the state of every step, T of them, and so runs forward
-            once less.
+        keep_states: reverse mode keeps the state of every step (T of them, and those of one frame
+            once more), and so runs forward once less.
 
     Raises:
         ValueError: an argument is out of range, or dt is above the stable bound at rest.

@@ -251,6 +251,28 @@ def test_reverse_mode_memory_grows_as_the_root(substeps, measure):
     measure("V44", f"{what}: memory, 1024 against 256 steps", long / short, below=2.6)
 
 
+def test_keeping_the_states_changes_nothing_but_the_memory():
+    """Same gradient; T states, those of one frame once more, and a few."""
+    scene, state = one_body(n=400)
+    size = sum(a.nbytes for a in (state.position, state.v, state.C, state.He))
+
+    def gradient(keep_states):
+        def loss(v):
+            moving = eqx.tree_at(lambda s: s.v, state, v)
+            motion = pgjax.simulate(
+                scene, moving, dt=DT, frames=4, substeps=64, keep_states=keep_states
+            )
+            return jnp.sum(motion.final.x)
+
+        compiled = jax.jit(jax.grad(loss)).lower(state.v).compile()
+        return compiled(state.v), compiled.memory_analysis().temp_size_in_bytes / size
+
+    (few, little), (all_of_them, much) = gradient(False), gradient(True)
+    np.testing.assert_allclose(all_of_them, few, rtol=0, atol=1e-4 * float(jnp.abs(few).max()))
+    assert little < 2 * 16 + 60
+    assert 256 < much < 256 + 64 + 60
+
+
 def test_materials_far_apart_do_not_meet(measure):
     """H43: slices of one scene equal separate scenes."""
     x, v = particles(12, size=0.2)

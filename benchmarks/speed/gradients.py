@@ -21,7 +21,9 @@ from benchmarks.speed.with_pgjax import rollout, setup
 DIFFERENCES = (1e-3, 1e-4, 1e-5, 1e-6)
 
 
-def _program(case: Case, variant: str, steps: int) -> tuple[Any, tuple, tuple]:
+def _program(
+    case: Case, variant: str, steps: int, *, keep_states: bool = False
+) -> tuple[Any, tuple, tuple]:
     """The function of `(v, E, scene, state)`, its arguments, and a tangent of the first two."""
     scene, state = setup(case, variant)
     random = np.random.default_rng(0)
@@ -30,7 +32,7 @@ def _program(case: Case, variant: str, steps: int) -> tuple[Any, tuple, tuple]:
     def value(v: Any, E: Any, scene: Any, state: Any, weights: Any) -> Any:
         scene = eqx.tree_at(lambda s: s.materials[0].elasticity.E, scene, E)
         state = eqx.tree_at(lambda s: s.v, state, v)
-        final = rollout(scene, state, substeps=steps).final
+        final = rollout(scene, state, substeps=steps, keep_states=keep_states).final
         return jnp.sum(weights * final.position)
 
     E = jnp.asarray(cases.E, state.dtype)
@@ -60,9 +62,11 @@ def cost(case: Case, variant: str, steps: int, rounds: int) -> dict[str, float]:
     The programs take turns; medians. A first round does not count.
     """
     value, arguments, tangent = _program(case, variant, steps)
+    keeping = _program(case, variant, steps, keep_states=True)[0]
     programs = {
         "value": (_compiled(value, *arguments), arguments),
         "reverse": (_compiled(jax.grad(value, argnums=(0, 1)), *arguments), arguments),
+        "kept": (_compiled(jax.grad(keeping, argnums=(0, 1)), *arguments), arguments),
         "forward": (
             _compiled(_forward_mode(value), tangent, *arguments),
             (tangent, *arguments),
@@ -78,7 +82,11 @@ def cost(case: Case, variant: str, steps: int, rounds: int) -> dict[str, float]:
         name: statistics.median(measured[1:]) / steps / case.particles * 1e9
         for name, measured in times.items()
     }
-    return ns | {"memory": _states(programs["reverse"][0], arguments)}
+    memory = {
+        name: _states(programs[program][0], arguments)
+        for name, program in (("memory", "reverse"), ("kept memory", "kept"))
+    }
+    return ns | memory
 
 
 def _states(program: Any, arguments: tuple) -> float:

@@ -75,8 +75,10 @@ def gradient_cost(
         return {
             "reverse": ns["reverse"],
             "reverse ratio": ns["reverse"] / ns["value"],
+            "kept": ns["kept"],
             "forward ratio": ns["forward"] / ns["value"],
             "memory": ns["memory"],
+            "kept memory": ns["kept memory"],
         }
 
     names = {
@@ -84,6 +86,8 @@ def gradient_cost(
         "reverse ratio": (f"gradient over value, {steps} steps", "ratio"),
         "forward ratio": (f"one tangent over value, {steps} steps", "ratio"),
         "memory": _memory_of(steps),
+        "kept": (f"gradient with all states kept, {steps} steps", "ns per particle-step"),
+        "kept memory": (f"memory of gradient with all states kept, {steps} steps", "states"),
     }
     return _rows(case, threads, _by_scheme(case, columns, measure), names)
 
