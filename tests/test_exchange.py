@@ -2,12 +2,14 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pgjax import exchange, native
+import pgjax
+from pgjax import boundary, exchange, models, native
 from pgjax.exchange import Receiver, Sender
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="there are no native kernels")
@@ -182,3 +184,78 @@ def test_velocities_are_what_they_say(contact, d):
     close(native_one(*operands), jax.jit(plain)(*operands), 100 * EPS)
     close(pulled(native_one, 3, operands), pulled(plain, 3, operands), 1000 * EPS)
     close(moved(native_one, 3, operands), moved(plain, 3, operands), 1000 * EPS)
+
+
+def scene_of(d, mapping=None):
+    """A scene whose steps are native, and a moving state that meets two walls."""
+    h, n = 0.1, 4**d
+    x = np.stack(np.meshgrid(*[np.arange(4) * h / 2 + 0.22] * d, indexing="ij"), -1).reshape(-1, d)
+    law = models.StVKHencky(1e4, 0.3) if mapping else models.NeoHookean(1e4, 0.3)
+    box = boundary.Box((0.2,) * d, (0.8,) * d, boundary.Separating(0.3))
+    grid = pgjax.Grid((0.0,) * d, (10,) * d, h)
+    scene = pgjax.Scene(
+        grid, models.Material(law, mapping), np.full(n, (h / 2) ** d), boundaries=[box]
+    )
+    rng = np.random.default_rng(0)
+    return scene, pgjax.initial_state(scene, x, 0.3 * rng.normal(size=(n, d)) - 0.5)
+
+
+@pytest.mark.float64
+@pytest.mark.parametrize("mapping", [None, models.DruckerPrager(30.0)])
+def test_every_transformation_of_a_rollout(mapping):
+    """Nested batches, both modes and both of one another, checkpoints: as one by one."""
+    scene, state = scene_of(3, mapping)
+
+    def final(v0, E):
+        own = eqx.tree_at(lambda s: s.materials[0].elasticity.E, scene, E)
+        moving = eqx.tree_at(lambda s: s.v, state, state.v + v0[None])
+        return pgjax.simulate(own, moving, dt=1e-3, frames=1, substeps=3, throw=False).final.x[
+            :5, 0
+        ]
+
+    def energy(v0, E):
+        return jnp.sum(jax.checkpoint(final)(v0, E) ** 2)
+
+    v0s = floats([[0.0, 0, 0], [0.1, -0.2, 0.3]])
+    Es = floats([1e4, 2e4])
+    both = jax.jit(jax.vmap(jax.vmap(final, (None, 0)), (0, None)))(v0s, Es)
+    slopes = jax.vmap(jax.vmap(jax.grad(energy, argnums=(0, 1)), (None, 0)), (0, None))(v0s, Es)
+    total = jax.grad(lambda v, e: jnp.sum(jax.vmap(energy, (None, 0))(v, e)), argnums=(0, 1))
+    for i, v0 in enumerate(v0s):
+        for k, E in enumerate(Es):
+            close([both[i, k]], [final(v0, E)], 1e-12)
+            one = jax.grad(energy, argnums=(0, 1))(v0, E)
+            close([slopes[0][i, k], slopes[1][i, k]], one, 1e-10)
+        by_v, by_E = total(v0, Es)
+        close([by_v, by_E], [slopes[0][i].sum(0), slopes[1][i]], 1e-10)
+    forward, reverse = (j(final, argnums=(0, 1))(v0s[1], Es[0]) for j in (jax.jacfwd, jax.jacrev))
+    close(forward, reverse, 1e-10)
+    if mapping is not None:
+        return  # Spectral functions have first derivatives only.
+    # A derivative of a derivative goes through the same functions in JAX.
+    hessian = jax.jacfwd(jax.grad(energy))(v0s[1], Es[0])
+    h = 1e-5
+    for axis in range(3):
+        step = h * jnp.eye(3)[axis]
+        ahead, behind = (jax.grad(energy)(v0s[1] + s * step, Es[0]) for s in (1, -1))
+        close([hessian[axis]], [(ahead - behind) / (2 * h)], 1e-5)
+
+
+def test_inside_shard_map():
+    """Particles in a shard: the grid of a shard, and its derivative."""
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("b",))
+    P = jax.sharding.PartitionSpec
+    operands, static = send_case("neo_hookean", 2, 2, True, False)
+    *own, mu, lam, numbers = operands
+
+    def total(mu, *own):
+        grid = exchange._send(*own, mu, lam, numbers, **static)[0]
+        return jax.lax.psum(jnp.sum(grid**2), "b")
+
+    sharded = jax.shard_map(total, mesh=mesh, in_specs=(P(), *[P("b")] * len(own)), out_specs=P())
+    plain = jnp.sum(exchange._send(*operands, **static)[0] ** 2)
+    np.testing.assert_allclose(sharded(mu, *own), plain, rtol=1e-5)
+    slope = jax.grad(lambda mu: jnp.sum(exchange._send(*own, mu, lam, numbers, **static)[0] ** 2))(
+        mu
+    )
+    np.testing.assert_allclose(jax.grad(sharded)(mu, *own), slope, rtol=1e-4)
