@@ -226,7 +226,8 @@ def _grid_to_particles(
         material, history = scene.materials[0], state.history[0]
         if material.plasticity is not None:
             history = material.plasticity.remember(history, out.history)
-        histories = (history,)
+        # There are other materials only where none of them flows.
+        histories = (history, *state.history[1:])
     else:
         mapping = functools.partial(_return_map, scene, state.history, dt)
         plastic = scene.is_plastic

@@ -37,7 +37,14 @@ def test_extend():
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "docs/conventions.md", "docs/design.md", "docs/scene-files.md"]
+    "page",
+    [
+        "README.md",
+        "docs/conventions.md",
+        "docs/design.md",
+        "docs/scene-files.md",
+        "docs/viewer.md",
+    ],
 )
 def test_links(page):
     path = ROOT / page

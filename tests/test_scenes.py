@@ -8,13 +8,14 @@ import imageio_ffmpeg
 import jax
 import numpy as np
 import pytest
-from scene_files import DROP, changed, write
+from scene_files import CAMERA, DROP, GRID, JELLY, MODEL, changed, planned, write
 
 from pgjax import cli
 from pgjax.render import Gaussians, load_ply, save_ply
 from pgjax.result import SimulationError
 from pgjax.scenes import SceneError, plan, presets, read_scene, resolve
 from pgjax.scenes.capture import upright
+from pgjax.scenes.run import states
 
 BODY = "region = { lower = [-1, -3, -1], upper = [1, -0.5, 1] }"
 SCENE = changed(DROP, ("size = 0.5", f"{BODY}\nsize = 0.5"))
@@ -167,6 +168,14 @@ def test_run_writes_video_pictures_and_plys(folder, capsys):
     assert cli.main(["run", str(folder / "drop.toml"), "--out", str(out)]) == 1
     assert "so that nothing is overwritten" in capsys.readouterr().err
     assert (out / "video.mp4").read_bytes() == before
+
+
+def test_two_elastic_materials_move(tmp_path):
+    lower = "region = { lower = [-1, -1, -1], upper = [1, 1, 0.2] }"
+    p = planned(tmp_path, MODEL, GRID, JELLY, lower, JELLY, CAMERA, frames=1)
+    assert len(p.scene.materials) == 2
+    (_, before), (_, after) = states(p, p.state, 0)
+    assert int(after.step) == int(before.step) + p.substeps
 
 
 def test_leaving_the_grid_keeps_what_was_computed(folder, capsys):

@@ -73,8 +73,8 @@ void send_pull(const Shape<D>& shape, Index batch, const Sender<T>& in, Batched<
     const T factor = Mls ? -dt / D_p * h : -dt / h;
     const Parameter<T> mu{in.parameters[0].at(b), in.parameter_step[0]};
     const Parameter<T> lam{in.parameters[1].at(b), in.parameter_step[1]};
-    std::memset(out.position.at(b), 0, P * D * sizeof(T));
-    if (in.has_H) std::memset(out.H.at(b), 0, P * 9 * sizeof(T));
+    clear(out.position.at(b), P * D * sizeof(T), pool);
+    if (in.has_H) clear(out.H.at(b), P * 9 * sizeof(T), pool);
     // Of h through mass h C, of factor, of mu and of lam.
     Sums<4> sums(chunks);
     const auto pull_group = [&](Index start, int count, double* partial) {

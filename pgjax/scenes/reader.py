@@ -268,10 +268,14 @@ def _as_float(value: float) -> float:
 
 def parse(path: Path) -> Table:
     """The root table of a TOML file."""
+    return Table(path.name, content(path), path.parent)
+
+
+def content(path: Path) -> dict[str, Any]:
+    """What is written in a TOML file."""
     if not path.is_file():
         raise SceneError(f"The scene file {path} does not exist{_neighbour(path)}.")
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{path} is not a TOML file: {error}.") from error
-    return Table(path.name, data, path.parent)

@@ -115,7 +115,7 @@ class _Recorder:
     def play(self, progress: Callable[[int, int], None] | None) -> None:
         """Run what is left of the plan, as far as nothing goes wrong."""
         record, start = self._latest
-        for frame, state in _states(self._plan, start, max(record.frame, 0)):
+        for frame, state in states(self._plan, start, max(record.frame, 0)):
             if frame > record.frame:
                 self._add(frame, state)
             if frame > 0 and progress is not None:
@@ -214,7 +214,7 @@ def _state_of(plan: Plan, folder: Path, record: Record) -> State:
     return state
 
 
-def _states(plan: Plan, state: State, frame: int) -> Iterator[tuple[int, State]]:
+def states(plan: Plan, state: State, frame: int) -> Iterator[tuple[int, State]]:
     """The given frame and state and those that follow, as far as nothing goes wrong.
 
     The next frame is already being simulated while the caller draws this one.

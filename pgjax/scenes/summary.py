@@ -20,25 +20,40 @@ from pgjax.state import State
 
 def summary(plan: Plan) -> str:
     """What will be compiled, in a few lines."""
+    return "\n".join(f"{name:10} {text}" for name, text in facts(plan))
+
+
+def facts(plan: Plan) -> list[tuple[str, str]]:
+    """The lines of the summary: what each is about, and what it says."""
     scene = plan.scene
     bound = float(scene.rest_limit())
     grid = scene.grid
-    lines = [
-        f"scene      {plan.name}: {scene.particle_count} particles"
-        + (f", {len(plan.still)} Gaussians that do not move" if len(plan.still) else ""),
+    return [
+        (
+            "scene",
+            f"{plan.name}: {scene.particle_count} particles"
+            + (f", {len(plan.still)} Gaussians that do not move" if len(plan.still) else ""),
+        ),
         *(
-            f"material   {_describe(m)}, {count} particles"
+            ("material", f"{_describe(m)}, {count} particles")
             for m, count in zip(scene.materials, scene.counts, strict=True)
         ),
-        f"grid       {' x '.join(map(str, grid.shape))} cells of {float(grid.h):.4g} m, "
-        f"{_spline(plan)} spline, {type(scene.scheme).__name__}",
-        f"time step  {plan.dt:.4g} s, {plan.dt / bound:.2f} of the stable one at rest; "
-        f"{plan.substeps} steps a frame, {plan.frames} frames at {plan.fps:g} per second",
-        f"computing  {state_kind(plan)} on {jax.devices()[0].platform.upper()}, "
-        f"JAX {jax.__version__}",
-        *(f"note       {note}" for note in plan.notes),
+        (
+            "grid",
+            f"{' x '.join(map(str, grid.shape))} cells of {float(grid.h):.4g} m, "
+            f"{_spline(plan)} spline, {type(scene.scheme).__name__}",
+        ),
+        (
+            "time step",
+            f"{plan.dt:.4g} s, {plan.dt / bound:.2f} of the stable one at rest; "
+            f"{plan.substeps} steps a frame, {plan.frames} frames at {plan.fps:g} per second",
+        ),
+        (
+            "computing",
+            f"{state_kind(plan)} on {jax.devices()[0].platform.upper()}, JAX {jax.__version__}",
+        ),
+        *(("note", note) for note in plan.notes),
     ]
-    return "\n".join(lines)
 
 
 def forecast(plan: Plan, folder: Path, *, ply_frames: bool, trajectory_frames: bool) -> str:
