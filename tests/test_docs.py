@@ -10,9 +10,9 @@ import pytest
 ROOT = pathlib.Path(__file__).parent.parent
 
 
-def run_blocks(path):
+def run_blocks(path, **given):
     """Run the Python blocks of a page one after the other; returns their names."""
-    names = {"__name__": "docs"}
+    names = {"__name__": "docs", **given}
     blocks = re.findall(r"```python\n(.*?)```", path.read_text(), flags=re.DOTALL)
     assert blocks
     for block in blocks:
@@ -36,16 +36,31 @@ def test_extend():
     assert all(slope != 0 for slope in names["slopes"])
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        "README.md",
-        "docs/conventions.md",
-        "docs/design.md",
-        "docs/scene-files.md",
-        "docs/viewer.md",
-    ],
-)
+def test_rendering(tmp_path):
+    names = run_blocks(ROOT / "docs" / "rendering.md", folder=tmp_path)
+    np.testing.assert_allclose(names["image"].rgb, names["same"].rgb, atol=1e-5)
+    assert float(jnp.abs(names["slope"]).max()) > 0
+    # What is looked at is in the centre.
+    pixels, _ = names["centred"].project(jnp.zeros((1, 3), names["means"].dtype))
+    np.testing.assert_allclose(pixels, [[32, 24]], atol=1e-3)
+    np.testing.assert_allclose(names["film"][0], names["images"].rgb[0], atol=1e-3)
+    assert float(jnp.abs(names["pull"]).max()) > 0
+    assert (tmp_path / "film.mp4").stat().st_size > 0
+    seen = np.asarray(names["seen"])
+    assert seen.any()
+    assert set(np.unique(names["label_map"])) <= {-1, 0, 1, 2}
+    # The camera looks along −x: what moves by +0.02 in x, y and z goes to the right and up.
+    flow = np.asarray(names["flow_map"])[seen]
+    assert flow[:, 0].min() > 0
+    assert flow[:, 1].max() < 0
+    lengths = np.linalg.norm(np.asarray(names["normal_map"])[seen], axis=-1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-3)
+
+
+PAGES = ("conventions", "design", "extend", "rendering", "scene-files", "viewer")
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])
 def test_links(page):
     path = ROOT / page
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):

@@ -96,7 +96,7 @@ def parameters(seed, scene=smooth_scene):
 
 def frozen(gaussians, point, rule, antialiased=False):
     """The image as a function of the parameters, in the order in depth that it has at `point`."""
-    constants = rasterize._constants(rule, gaussians.means.dtype)
+    constants = rasterize.constants_of(rule, gaussians.means.dtype)
 
     def splats(p):
         parts = {name: p[name] for name in ("means", "factors", "opacities", "sh")}

@@ -437,8 +437,8 @@ import signal, sys, time
 import pgjax.cli, pgjax.scenes
 signal.signal(signal.SIGINT, signal.default_int_handler)
 run = sys.modules["pgjax.scenes.run"]
-draw = run._draw
-run._draw = lambda *arguments: (time.sleep(0.3), draw(*arguments))[1]
+paint = run._Painter.paint
+run._Painter.paint = lambda *arguments: (time.sleep(0.3), paint(*arguments))[1]
 sys.exit(pgjax.cli.main(sys.argv[1:]))
 """
 

@@ -126,7 +126,7 @@ FAULTS = [
     ('file = "cameras.json"\nindex = 0\nname = "north"', "`index` must be left out where `name`"),
     (
         'file = "cameras.json"\nazimuth = 30',
-        "`azimuth` is not a known key; allowed are file, index, name, width, background, max_",
+        "`azimuth` is not a known key; allowed are file, index, name, width, keyframes, ",
     ),
     ("index = 1", "`index` is not a known key; allowed are file, target"),
     ("azimut = 1", "did you mean `azimuth`?"),

@@ -17,7 +17,7 @@ import pytest
 from scene_files import DROP, ball, changed, write
 
 from pgjax import cli
-from pgjax.render import Camera, Gaussians, render, save_ply
+from pgjax.render import Camera, Gaussians, concatenate, render, save_ply
 from pgjax.scenes import SceneError, plan, read_scene
 from pgjax.scenes.run import carried, states
 from pgjax.view import App, Live, require_viser, show_capture, show_run
@@ -101,7 +101,8 @@ def test_what_is_not_finite_is_not_seen():
 @needs_viser
 def test_every_frame_is_that_of_the_run(folder, live, serve):
     p = plan(read_scene(folder / "drop.toml"))
-    expected = [carried(p, state.x, state.F)[0] for _, state in states(p, p.state, 0)]
+    moved = [carried(p, state.x, state.F)[0] for _, state in states(p, p.state, 0)]
+    expected = [concatenate([one, p.still]) for one in moved]
     assert len(p.still)
     app = serve(live.show(), live=live)
     wait(app, lambda: app.reel.is_done)

@@ -19,6 +19,10 @@ from pgjax.render.media import save_video as save_video
 from pgjax.render.needles import AxisReport as AxisReport
 from pgjax.render.needles import measure_axes as measure_axes
 from pgjax.render.needles import split_long as split_long
+from pgjax.render.normals import normals as normals
+from pgjax.render.paths import CameraPath as CameraPath
+from pgjax.render.paths import interpolate as interpolate
+from pgjax.render.paths import stack_cameras as stack_cameras
 from pgjax.render.ply import Capture as Capture
 from pgjax.render.ply import load_ply as load_ply
 from pgjax.render.ply import save_ply as save_ply
@@ -28,3 +32,5 @@ from pgjax.render.rules import RULE_3DGS as RULE_3DGS
 from pgjax.render.rules import RULE_EXACT as RULE_EXACT
 from pgjax.render.rules import RULE_GSPLAT15 as RULE_GSPLAT15
 from pgjax.render.rules import Rule as Rule
+from pgjax.render.surroundings import Surroundings as Surroundings
+from pgjax.render.surroundings import prepare_surroundings as prepare_surroundings

@@ -2,6 +2,7 @@
 
 import functools
 import warnings
+from collections.abc import Callable
 from typing import final
 
 import equinox as eqx
@@ -78,37 +79,50 @@ def render(
     ACM Transactions on Graphics 42(4), 2023; M. Zwicker et al., "EWA volume splatting", 2001.
     """
     dtype = gaussians.means.dtype
-    behind = _background(background, camera).astype(dtype)
-    n = len(gaussians)
+    behind = image_behind(background, camera).astype(dtype)
+    features = rows_of(features, gaussians)
+    constants = constants_of(rule, dtype)
+    if capacity is None:
+        needed = functools.partial(_needed, gaussians, camera, constants, antialiased=antialiased)
+        capacity = capacity_for(len(gaussians), camera, dtype, needed)
+    image = _render(
+        gaussians,
+        camera,
+        behind,
+        features,
+        constants,
+        antialiased=antialiased,
+        capacity=capacity,
+    )
+    warn_of_broken(image, len(gaussians), stacklevel=3)
+    return image
+
+
+def rows_of(features: Float[Array, "n k"] | None, gaussians: Gaussians) -> Float[Array, "n k"]:
+    """The features in the precision of the Gaussians; none are rows of length 0."""
+    n, dtype = len(gaussians), gaussians.means.dtype
     if features is None:
-        features = jnp.zeros((n, 0), dtype)
+        return jnp.zeros((n, 0), dtype)
     if features.shape[0] != n:
         raise ValueError(
             f"Argument `features` must have one row for each of {n} Gaussians, but has shape "
             f"{features.shape}."
         )
-    constants = _constants(rule, dtype)
-    if capacity is None:
-        capacity = _capacity(gaussians, camera, constants, antialiased)
-    image = _render(
-        gaussians,
-        camera,
-        behind,
-        features.astype(dtype),
-        constants,
-        antialiased=antialiased,
-        capacity=capacity,
-    )
+    return features.astype(dtype)
+
+
+def warn_of_broken(image: Image, n: int, *, stacklevel: int) -> None:
+    """Say how many of n Gaussians are not drawn, outside of `jit`."""
     broken = concrete(image.not_finite)
     if broken is not None and broken > 0:
         warnings.warn(
-            f"{broken} of {n} Gaussians are not finite, or overflow in {dtype}, and are not drawn.",
-            stacklevel=2,
+            f"{broken} of {n} Gaussians are not finite, or overflow in {image.rgb.dtype}, and are "
+            "not drawn.",
+            stacklevel=stacklevel,
         )
-    return image
 
 
-def _background(background: Triple | ArrayLike, camera: Camera) -> Array:
+def image_behind(background: Triple | ArrayLike, camera: Camera) -> Array:
     """Three numbers, or one image of them."""
     behind = jnp.asarray(background)
     if behind.shape not in ((3,), (camera.height, camera.width, 3)):
@@ -120,7 +134,7 @@ def _background(background: Triple | ArrayLike, camera: Camera) -> Array:
     return behind
 
 
-def _constants(rule: Rule, dtype: np.dtype) -> Float[Array, "5"]:
+def constants_of(rule: Rule, dtype: np.dtype) -> Float[Array, "5"]:
     """Those of the rule as an array, so that another rule does not recompile."""
     numbers = (rule.alpha_max, rule.alpha_min, rule.stop, float(rule.smooth), rule.low_pass)
     return jnp.asarray(numbers, dtype=dtype)
@@ -192,19 +206,18 @@ def shape_of(splats: Splat) -> Float[Array, "n 6"]:
     return jnp.stack(columns, axis=-1)
 
 
-def _capacity(
-    gaussians: Gaussians, camera: Camera, constants: Float[Array, "5"], antialiased: bool
+def capacity_for(
+    n: int, camera: Camera, dtype: np.dtype, needed: Callable[[], Int[Array, ""]]
 ) -> int:
     """Length of the lists of plain JAX: what is needed, or inside of `jit` what may be needed."""
-    default = compositing.default_capacity(len(gaussians), camera.width, camera.height)
-    dtype = gaussians.means.dtype
+    default = compositing.default_capacity(n, camera.width, camera.height)
     if native.available() and native.library("raster", jnp.dtype(dtype).name) is not None:
         return default
-    needed = concrete(_needed(gaussians, camera, constants, antialiased=antialiased))
-    if needed is None:
+    number = concrete(needed())
+    if number is None:
         return default
     # Of a few lengths only: each is compiled once.
-    return 1 << max(10, int(needed - 1).bit_length())
+    return 1 << max(10, int(number - 1).bit_length())
 
 
 @functools.partial(jax.jit, static_argnames="antialiased")
@@ -212,6 +225,11 @@ def _needed(
     gaussians: Gaussians, camera: Camera, constants: Float[Array, "5"], *, antialiased: bool
 ) -> Int[Array, ""]:
     splats = project(gaussians, camera, constants[4], antialiased=antialiased)
+    return pairs_of(splats, camera, constants[:4])
+
+
+def pairs_of(splats: Splat, camera: Camera, limits: Float[Array, "4"]) -> Int[Array, ""]:
+    """How many pairs (splat, tile) there are."""
     return compositing.needed_capacity(
-        constants[:4], shape_of(splats), splats.depth, width=camera.width, height=camera.height
+        limits, shape_of(splats), splats.depth, width=camera.width, height=camera.height
     )

@@ -15,11 +15,13 @@ import jax
 import numpy as np
 
 from pgjax.render import (
+    Camera,
     Gaussians,
+    Surroundings,
     bound_stretch,
     concatenate,
     deform,
-    render,
+    prepare_surroundings,
     save_image,
     save_ply,
     save_video,
@@ -103,6 +105,7 @@ class _Recorder:
     def __init__(self, plan: Plan, folder: Path, record: Record):
         self._plan = plan
         self._folder = folder
+        self._painter = _Painter(plan)
         # The last frame of which all files are written, and its state.
         self._latest = record, _state_of(plan, folder, record)
         self._kept = record.frame
@@ -124,12 +127,12 @@ class _Recorder:
     def _add(self, frame: int, state: State) -> None:
         """Draw and write a frame, and keep its state if it is time."""
         record, _ = self._latest
-        gaussians, bounded = carried(self._plan, state.x, state.F)
+        moved, bounded = carried(self._plan, state.x, state.F)
         picture = picture_path(self._folder, frame)
-        save_image(picture, _draw(self._plan, gaussians, frame))
+        save_image(picture, self._painter.paint(moved, frame))
         files = record.files(self._folder, frame)
         for path in files:
-            self._write(path, state, gaussians)
+            self._write(path, state, moved)
         self._loose += [picture, *files]
         record = dataclasses.replace(
             record, frame=frame, most_bounded=max(bounded, record.most_bounded)
@@ -138,8 +141,9 @@ class _Recorder:
         if time.perf_counter() - self._kept_at >= _PATIENCE * self._cost:
             self._keep()
 
-    def _write(self, path: Path, state: State, gaussians: Gaussians) -> None:
+    def _write(self, path: Path, state: State, moved: Gaussians) -> None:
         if path.suffix == ".ply":
+            gaussians = concatenate([moved, self._plan.still])
             save_ply(path, gaussians.transformed(self._plan.to_simulation.inverse()))
             return
         t = np.asarray(int(state.step) * self._plan.dt, state.dtype)
@@ -250,15 +254,32 @@ def _nothing(state: State) -> None:
 
 
 def carried(plan: Plan, x: jax.Array, F: jax.Array) -> tuple[Gaussians, int]:
-    """All Gaussians of a frame, the moving ones deformed, and how many stretches were bounded."""
+    """The moving Gaussians of a frame, deformed, and how many stretches were bounded."""
     F, beyond = bound_stretch(F, plan.view.max_stretch)
-    moved = deform(plan.moving, x, F)
-    return concatenate([moved, plan.still]) if len(plan.still) else moved, int(beyond.sum())
+    return deform(plan.moving, x, F), int(beyond.sum())
 
 
-def _draw(plan: Plan, gaussians: Gaussians, frame: int) -> np.ndarray:
-    image = render(gaussians, plan.camera(frame), background=plan.view.background)
-    return np.clip(np.asarray(image.rgb), 0, 1)
+@final
+class _Painter:
+    """Draws frames; while the camera stands still, what does not move is projected once."""
+
+    def __init__(self, plan: Plan):
+        self._plan = plan
+        self._around: Surroundings | None = None
+
+    def paint(self, moved: Gaussians, frame: int) -> np.ndarray:
+        camera = self._plan.camera(frame)
+        if self._around is None or not _same(self._around.camera, camera):
+            self._around = prepare_surroundings(self._plan.still, camera)
+        image = self._around.render(moved, background=self._plan.view.background)
+        return np.clip(np.asarray(image.rgb), 0, 1)
+
+
+def _same(one: Camera, other: Camera) -> bool:
+    """Whether two cameras are equal, number by number."""
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    sizes = (one.width, one.height) == (other.width, other.height)
+    return sizes and all(np.array_equal(a, b) for a, b in pairs)
 
 
 def _summed_up(plan: Plan, state: State, record: Record, seconds: float) -> dict[str, Any]:

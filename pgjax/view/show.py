@@ -104,7 +104,7 @@ def _simulated(plan: Plan, camera: Camera) -> Iterator[Frame]:
 
 def _frame(plan: Plan, state: State, camera: Camera) -> Frame:
     gaussians, _ = carried(plan, state.x, state.F)
-    moving = splats(gaussians[: len(plan.moving)], camera.position)
+    moving = splats(gaussians, camera.position)
     return Frame(moving, tuple(state.status.messages()), bool(state.status.messages(ERRORS)))
 
 

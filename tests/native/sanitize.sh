@@ -9,6 +9,7 @@ for kinds in address,undefined thread; do
         "${CXX:-c++}" -std=c++17 -O1 -g -march=native -Wall -Wextra -Werror \
             "-fsanitize=$kinds" -fno-sanitize-recover=all -I../../pgjax/native "$program.cc" \
             -o "$out/$program" -pthread
-        echo "$program, $kinds: $("$out/$program")"
+        said=$("$out/$program")
+        echo "$program, $kinds: $said"
     done
 done
