@@ -26,9 +26,15 @@ class Process:
     Args:
         threads: CPUs it may use; all of them if None, where no time is measured.
         environment: variables on top of those of this process; None removes one.
+        module: what it runs.
     """
 
-    def __init__(self, threads: int | None, environment: dict[str, str | None] | None = None):
+    def __init__(
+        self,
+        threads: int | None,
+        environment: dict[str, str | None] | None = None,
+        module: str = "benchmarks.speed.worker",
+    ):
         variables = {**os.environ, "JAX_PLATFORMS": "cpu", "ENABLE_TAICHI_HEADER_PRINT": "False"}
         for name, value in (environment or {}).items():
             if value is None:
@@ -38,7 +44,7 @@ class Process:
         self.log = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115
         chosen = [] if threads is None else [str(threads)]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.speed.worker", *chosen],
+            [sys.executable, "-m", module, *chosen],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self.log,

@@ -12,6 +12,7 @@ import os
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -61,21 +62,20 @@ class Worker:
         return function(**arguments)
 
 
-def main(threads: int | None) -> None:
+def serve(threads: int | None, answer: Callable[..., Any]) -> None:
     """Answer until the input ends. What libraries print goes to the standard error."""
     if threads is not None:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    worker = Worker()
     for line in sys.stdin:
         try:
-            answer = {"value": worker.answer(**json.loads(line))}
+            reply = {"value": answer(**json.loads(line))}
         except Exception as error:
             traceback.print_exc()
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(answer), file=answers, flush=True)
+            reply = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(reply), file=answers, flush=True)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else None)
+    serve(int(sys.argv[1]) if len(sys.argv) > 1 else None, Worker().answer)
