@@ -276,6 +276,14 @@ def _native_mapping(scene: Scene, state: State) -> tuple[str, tuple[Array, ...]]
     return name, parameters(material, history)
 
 
+def in_native_stages(scene: Scene, state: State) -> bool:
+    """Whether the passes over particles and grid are native and work in place."""
+    box, *others = scene.boundaries or (None,)
+    walls = box is None or (isinstance(box, Box) and known(box.contact))
+    known_passes = _native_law(scene) is not None and _native_mapping(scene, state) is not None
+    return native.available() and known_passes and walls and not others
+
+
 def _return_map(
     scene: Scene, histories: tuple[Any, ...], dt: Scalar, H: Float[Array, "p 3 3"]
 ) -> tuple[Float[Array, "p 3 3"], tuple[Any, ...]]:

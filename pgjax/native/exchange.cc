@@ -68,14 +68,6 @@ ffi::Error Receive(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::
 
 }  // namespace
 
-#define PGJAX_CALL()                                                                     \
-  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("degree").Attr<bool>("mls") \
-      .Attr<std::int64_t>("kind")
-#define PGJAX_WALLS()                                                                          \
-  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("contact").Arg<Sides>().Arg<Sides>() \
-      .Arg<Sides>()
-#define PGJAX_RET Ret<ffi::Buffer<kType>>()
-
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send, Send,
                               PGJAX_CALL().Arg<Mask>().Arg<Mask>().Arg<In>().Arg<In>().Arg<In>()
                                   .Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()

@@ -55,3 +55,15 @@ Receiver<T> receiver(Mask& alive, Mask& finite, Mask& held, In& xi, In& g, In& p
 }
 
 }  // namespace
+
+#define PGJAX_CALL()                                                                     \
+  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("degree").Attr<bool>("mls") \
+      .Attr<std::int64_t>("kind")
+#define PGJAX_WALLS()                                                                          \
+  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("contact").Arg<Sides>().Arg<Sides>() \
+      .Arg<Sides>()
+#define PGJAX_RET Ret<ffi::Buffer<kType>>()
+// The floating operands of `sender` or `receiver`.
+#define PGJAX_FLOATS \
+  Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>() \
+      .Arg<In>().Arg<In>()

@@ -82,14 +82,6 @@ ffi::Error ReceivePull(ffi::ThreadPool threads, std::int64_t degree, bool mls, s
 
 }  // namespace
 
-#define PGJAX_CALL()                                                                     \
-  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("degree").Attr<bool>("mls") \
-      .Attr<std::int64_t>("kind")
-#define PGJAX_WALLS()                                                                          \
-  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("contact").Arg<Sides>().Arg<Sides>() \
-      .Arg<Sides>()
-#define PGJAX_RET Ret<ffi::Buffer<kType>>()
-
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send_pull, SendPull,
                               PGJAX_CALL().Arg<Mask>().Arg<Mask>().Arg<In>().Arg<In>().Arg<In>()
                                   .Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()

@@ -53,13 +53,6 @@ ffi::Error ReceiveTangent(ffi::ThreadPool threads, std::int64_t degree, bool mls
 
 }  // namespace
 
-#define PGJAX_CALL()                                                                     \
-  ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("degree").Attr<bool>("mls") \
-      .Attr<std::int64_t>("kind")
-#define PGJAX_RET Ret<ffi::Buffer<kType>>()
-#define PGJAX_FLOATS Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>() \
-    .Arg<In>().Arg<In>().Arg<In>()
-
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send_tangent, SendTangent,
                               PGJAX_CALL().Arg<Mask>().Arg<Mask>().PGJAX_FLOATS.PGJAX_FLOATS.PGJAX_RET);
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_receive_tangent, ReceiveTangent,

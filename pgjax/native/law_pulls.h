@@ -207,78 +207,54 @@ inline void pull_hencky(const Stretches<V>& s, const V eps_bar[6], const V* h, V
 // In: H, tau_Y, mu, and the cotangents of H and of the increment. Out: those of H, tau_Y, mu.
 template <class V>
 inline void pull_von_mises(const V* in, const V* bar, V* out) {
-  const V limit = in[9] / (2 * in[10]), zero = {}, one = zero + 1;
-  V b[6], e[3], delta[3], n[3], delta_bar[6], eps_bar[6];
-  left_strain(in, b);
-  const V change = volume_change(in);
-  const auto s = principal_stretches(b, change);
-  log_stretches(s, e);
-  const V mean = (e[0] + e[1] + e[2]) / 3;
-  V square = zero;
-  for (int i = 0; i < 3; ++i) square += (e[i] - mean) * (e[i] - mean);
-  const V norm = root(square), safe = norm > 0 ? norm : one;
-  const auto yields = (norm > limit) & (change > -1);
-  for (int i = 0; i < 3; ++i) {
-    n[i] = (e[i] - mean) / safe;
-    delta[i] = yields ? (limit - norm) * n[i] : zero;
-  }
-  pull_flow(s, delta, in, bar, out, delta_bar);
+  const V limit = in[9] / (2 * in[10]), zero = {};
+  V delta_bar[6], eps_bar[6];
+  const auto t = radial_return(in);
+  const V* n = t.n;
+  pull_flow(t.s, t.delta, in, bar, out, delta_bar);
   // delta = -dev eps + limit n, the increment |dev eps| - limit.
   const V along = n[0] * delta_bar[0] + n[1] * delta_bar[1] + n[2] * delta_bar[2];
-  const V share = limit / safe, increment_bar = bar[9];
+  const V share = limit / t.safe, increment_bar = bar[9];
   for (int i = 0; i < 6; ++i) eps_bar[i] = (share - 1) * delta_bar[i];
   for (int i = 0; i < 3; ++i) eps_bar[i] += (increment_bar - share * along) * n[i];
   const V third = (eps_bar[0] + eps_bar[1] + eps_bar[2]) / 3;
   for (int i = 0; i < 3; ++i) eps_bar[i] -= third;
-  for (int i = 0; i < 6; ++i) eps_bar[i] = yields ? eps_bar[i] : zero;
-  const V limit_bar = yields ? along - increment_bar : zero;
-  pull_hencky(s, eps_bar, in, out);
-  for (int i = 0; i < 9; ++i) out[i] = yields ? out[i] : bar[i];
+  for (int i = 0; i < 6; ++i) eps_bar[i] = t.yields ? eps_bar[i] : zero;
+  const V limit_bar = t.yields ? along - increment_bar : zero;
+  pull_hencky(t.s, eps_bar, in, out);
+  for (int i = 0; i < 9; ++i) out[i] = t.yields ? out[i] : bar[i];
   out[9] = limit_bar / (2 * in[10]), out[10] = -limit_bar * limit / in[10];
   // An infinite yield stress is never reached, nor does it have a derivative.
-  for (int i = 9; i < 11; ++i) out[i] = yields ? out[i] : zero;
+  for (int i = 9; i < 11; ++i) out[i] = t.yields ? out[i] : zero;
 }
 
 // In: H, slope, apex, gained, and the cotangents of H and of what is gained; `correct`: whether the
 // volume gained is given back. Out: those of H, slope, apex, gained.
 template <class V>
 inline void pull_drucker_prager(const V* in, const V* bar, V* out, bool correct) {
-  const V slope = in[9], apex = in[10], gained = in[11], zero = {}, one = zero + 1;
-  V b[6], e[3], moved[3], delta[3], n[3], delta_bar[6], eps_bar[6];
-  left_strain(in, b);
-  const V change = volume_change(in);
-  const auto s = principal_stretches(b, change);
-  log_stretches(s, e);
-  for (int i = 0; i < 3; ++i) moved[i] = e[i] + (gained / 3 - apex);
-  const V trace = moved[0] + moved[1] + moved[2], mean = trace / 3;
-  V square = zero;
-  for (int i = 0; i < 3; ++i) square += (moved[i] - mean) * (moved[i] - mean);
-  const V norm = root(square), safe = norm > 0 ? norm : one, excess = norm + slope * trace;
-  const auto tip = trace > 0, upright = change > -1;
-  const auto yields = (tip | (excess > 0)) & upright, cone = yields & ~tip;
-  for (int i = 0; i < 3; ++i) {
-    n[i] = (moved[i] - mean) / safe;
-    const V flowed = (tip ? zero : moved[i] - excess * n[i]) + apex - e[i];
-    delta[i] = yields ? flowed : (upright ? gained / 3 : zero);
-  }
-  pull_flow(s, delta, in, bar, out, delta_bar);
+  const V slope = in[9], zero = {};
+  V delta_bar[6], eps_bar[6];
+  const auto t = cone_return(in);
+  const V* n = t.n;
+  const auto tip = t.yields & ~t.cone;
+  pull_flow(t.s, t.delta, in, bar, out, delta_bar);
   // Gained <- gained - tr delta where the material yields, else 0.
   const V history_bar = correct ? bar[9] : zero;
-  for (int i = 0; i < 3; ++i) delta_bar[i] -= yields ? history_bar : zero;
+  for (int i = 0; i < 3; ++i) delta_bar[i] -= t.yields ? history_bar : zero;
   const V along = n[0] * delta_bar[0] + n[1] * delta_bar[1] + n[2] * delta_bar[2];
   const V total = delta_bar[0] + delta_bar[1] + delta_bar[2];
   // On the cone delta = gained/3 - dev eps - slope tr n, tr = tr eps + gained - 3 apex; at the tip
   // it is apex - eps.
-  const V share = cone ? slope * trace / safe : zero, trace_bar = cone ? -slope * along : zero;
+  const V share = t.cone ? slope * t.trace / t.safe : zero, trace_bar = t.cone ? -slope * along : zero;
   for (int i = 0; i < 6; ++i) eps_bar[i] = -(1 + share) * delta_bar[i];
-  for (int i = 0; i < 3; ++i) eps_bar[i] += share * along * n[i] + (cone ? (1 + share) * total / 3 : zero) + trace_bar;
-  for (int i = 0; i < 6; ++i) eps_bar[i] = yields ? eps_bar[i] : zero;
-  pull_hencky(s, eps_bar, in, out);
-  const V through_elastic = correct ? (upright & ~yields ? total / 3 : zero) : zero;
-  out[9] = cone ? -trace * along : zero;
-  out[10] = (tip & yields ? total : zero) - 3 * trace_bar;
-  out[11] = (cone ? total / 3 : through_elastic) + trace_bar;
-  out[11] += correct ? (yields | ~upright ? history_bar : zero) : bar[9];
+  for (int i = 0; i < 3; ++i) eps_bar[i] += share * along * n[i] + (t.cone ? (1 + share) * total / 3 : zero) + trace_bar;
+  for (int i = 0; i < 6; ++i) eps_bar[i] = t.yields ? eps_bar[i] : zero;
+  pull_hencky(t.s, eps_bar, in, out);
+  const V through_elastic = correct ? (t.upright & ~t.yields ? total / 3 : zero) : zero;
+  out[9] = t.cone ? -t.trace * along : zero;
+  out[10] = (tip ? total : zero) - 3 * trace_bar;
+  out[11] = (t.cone ? total / 3 : through_elastic) + trace_bar;
+  out[11] += correct ? (t.yields | ~t.upright ? history_bar : zero) : bar[9];
 }
 
 }  // namespace pgjax

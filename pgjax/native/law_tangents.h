@@ -126,75 +126,50 @@ inline void flow_tangent(const Stretches<V>& s, const V delta[3], const V ddelta
 // In: H, tau_Y, mu and their tangents. Out: those of H and of the increment.
 template <class V>
 inline void tangent_von_mises(const V* in, const V* din, V* out) {
-  const V limit = in[9] / (2 * in[10]), zero = {}, one = zero + 1;
-  V b[6], e[3], delta[3], n[3], deps[6], ddelta[6];
-  left_strain(in, b);
-  const V change = volume_change(in);
-  const auto s = principal_stretches(b, change);
-  log_stretches(s, e);
-  const V mean = (e[0] + e[1] + e[2]) / 3;
-  V square = zero;
-  for (int i = 0; i < 3; ++i) square += (e[i] - mean) * (e[i] - mean);
-  const V norm = root(square), safe = norm > 0 ? norm : one;
-  const auto yields = (norm > limit) & (change > -1);
+  const V limit = in[9] / (2 * in[10]), zero = {};
+  V deps[6], ddelta[6];
+  const auto t = radial_return(in);
+  const V* n = t.n;
   // An infinite yield stress is never reached.
-  const V share = yields ? limit / safe : zero;
-  const V dlimit = yields ? din[9] / (2 * in[10]) - limit * din[10] / in[10] : zero;
-  for (int i = 0; i < 3; ++i) {
-    n[i] = (e[i] - mean) / safe;
-    delta[i] = yields ? (limit - norm) * n[i] : zero;
-  }
-  hencky_tangent(s, in, din, deps);
+  const V share = t.yields ? limit / t.safe : zero;
+  const V dlimit = t.yields ? din[9] / (2 * in[10]) - limit * din[10] / in[10] : zero;
+  hencky_tangent(t.s, in, din, deps);
   const V third = (deps[0] + deps[1] + deps[2]) / 3;
   for (int i = 0; i < 3; ++i) deps[i] -= third;
   const V along = n[0] * deps[0] + n[1] * deps[1] + n[2] * deps[2];
   for (int i = 0; i < 6; ++i) ddelta[i] = (share - 1) * deps[i];
   for (int i = 0; i < 3; ++i) ddelta[i] += (dlimit - share * along) * n[i];
-  for (int i = 0; i < 6; ++i) ddelta[i] = yields ? ddelta[i] : zero;
-  flow_tangent(s, delta, ddelta, in, din, out);
-  for (int i = 0; i < 9; ++i) out[i] = yields ? out[i] : din[i];
-  out[9] = yields ? along - dlimit : zero;
+  for (int i = 0; i < 6; ++i) ddelta[i] = t.yields ? ddelta[i] : zero;
+  flow_tangent(t.s, t.delta, ddelta, in, din, out);
+  for (int i = 0; i < 9; ++i) out[i] = t.yields ? out[i] : din[i];
+  out[9] = t.yields ? along - dlimit : zero;
 }
 
 // In: H, slope, apex, gained and their tangents. Out: those of H and of what is gained.
 template <class V>
 inline void tangent_drucker_prager(const V* in, const V* din, V* out, bool correct) {
-  const V slope = in[9], apex = in[10], gained = in[11], zero = {}, one = zero + 1;
-  V b[6], e[3], moved[3], delta[3], n[3], deps[6], ddelta[6];
-  left_strain(in, b);
-  const V change = volume_change(in);
-  const auto s = principal_stretches(b, change);
-  log_stretches(s, e);
-  for (int i = 0; i < 3; ++i) moved[i] = e[i] + (gained / 3 - apex);
-  const V trace = moved[0] + moved[1] + moved[2], mean = trace / 3;
-  V square = zero;
-  for (int i = 0; i < 3; ++i) square += (moved[i] - mean) * (moved[i] - mean);
-  const V norm = root(square), safe = norm > 0 ? norm : one, excess = norm + slope * trace;
-  const auto tip = trace > 0, upright = change > -1;
-  const auto yields = (tip | (excess > 0)) & upright, cone = yields & ~tip;
-  for (int i = 0; i < 3; ++i) {
-    n[i] = (moved[i] - mean) / safe;
-    const V flowed = (tip ? zero : moved[i] - excess * n[i]) + apex - e[i];
-    delta[i] = yields ? flowed : (upright ? gained / 3 : zero);
-  }
-  hencky_tangent(s, in, din, deps);
+  const V slope = in[9], zero = {}, one = zero + 1;
+  V deps[6], ddelta[6];
+  const auto t = cone_return(in);
+  const V* n = t.n;
+  hencky_tangent(t.s, in, din, deps);
   const V volume = deps[0] + deps[1] + deps[2], dtrace = volume + din[11] - 3 * din[10];
   V along = zero;
   for (int i = 0; i < 3; ++i) along += n[i] * (deps[i] - volume / 3);
   // On the cone delta = gained/3 - dev eps - slope tr n; at the tip it is apex - eps.
-  const V share = slope * trace / safe;
+  const V share = slope * t.trace / t.safe;
   for (int i = 0; i < 6; ++i) {
     const V shear = i < 3 ? deps[i] - volume / 3 : deps[i];
     const V normal = i < 3 ? n[i] : zero, unit = i < 3 ? one : zero;
     const V on_cone = unit * din[11] / 3 - shear - share * (shear - along * normal) -
-                      (din[9] * trace + slope * dtrace) * normal;
+                      (din[9] * t.trace + slope * dtrace) * normal;
     const V at_tip = unit * din[10] - deps[i];
     const V inside = correct ? unit * din[11] / 3 : zero;
-    ddelta[i] = cone ? on_cone : (yields ? at_tip : (upright ? inside : zero));
+    ddelta[i] = t.cone ? on_cone : (t.yields ? at_tip : (t.upright ? inside : zero));
   }
-  flow_tangent(s, delta, ddelta, in, din, out);
+  flow_tangent(t.s, t.delta, ddelta, in, din, out);
   const V total = ddelta[0] + ddelta[1] + ddelta[2];
-  out[9] = correct ? (yields ? din[11] - total : (upright ? zero : din[11])) : din[11];
+  out[9] = correct ? (t.yields ? din[11] - total : (t.upright ? zero : din[11])) : din[11];
 }
 
 }  // namespace pgjax

@@ -213,52 +213,82 @@ inline void flow_along(const Stretches<V>& s, const V delta[3], const V* h, V* o
     }
 }
 
-// Radial return. In: H, tau_Y, mu. Out: H, the plastic strain increment.
+// The trial state of a return mapping along the principal directions, and where it is mapped to.
 template <class V>
-inline void von_mises(const V* in, V* out) {
-  const V limit = in[9] / (2 * in[10]), zero = {}, one = zero + 1;
-  V b[6], e[3], delta[3];
+struct Trial {
+  Stretches<V> s;
+  V e[3];             // Hencky strains
+  V n[3], norm, safe;  // direction and size of their deviator; the size, or 1 instead of 0
+  V delta[3];         // the change of the strains
+  BitsOf<V> upright, yields;
+};
+template <class V>
+inline Trial<V> trial_state(const V* in) {
+  const V zero = {}, one = zero + 1;
+  Trial<V> t;
+  V b[6];
   left_strain(in, b);
   const V change = volume_change(in);
-  const auto s = principal_stretches(b, change);
-  log_stretches(s, e);
-  const V mean = (e[0] + e[1] + e[2]) / 3;
+  t.s = principal_stretches(b, change);
+  log_stretches(t.s, t.e);
+  const V mean = (t.e[0] + t.e[1] + t.e[2]) / 3;
   V square = zero;
-  for (int i = 0; i < 3; ++i) square += (e[i] - mean) * (e[i] - mean);
-  const V norm = root(square);
-  const auto yields = (norm > limit) & (change > -1);
-  const V gamma = yields ? norm - limit : zero;
-  for (int i = 0; i < 3; ++i) delta[i] = -gamma * (e[i] - mean) / (norm > 0 ? norm : one);
-  flow_along(s, delta, in, out);
-  out[9] = gamma;
+  for (int i = 0; i < 3; ++i) square += (t.e[i] - mean) * (t.e[i] - mean);
+  t.norm = root(square), t.safe = t.norm > 0 ? t.norm : one;
+  for (int i = 0; i < 3; ++i) t.n[i] = (t.e[i] - mean) / t.safe;
+  t.upright = change > -1;
+  return t;
+}
+
+// Radial return. In: H, tau_Y, mu.
+template <class V>
+inline Trial<V> radial_return(const V* in) {
+  const V limit = in[9] / (2 * in[10]), zero = {};
+  Trial<V> t = trial_state(in);
+  t.yields = (t.norm > limit) & t.upright;
+  for (int i = 0; i < 3; ++i) t.delta[i] = t.yields ? (limit - t.norm) * t.n[i] : zero;
+  return t;
 }
 
 // Return to the cone or its tip. In: H, alpha (3 lam + 2 mu)/(2 mu), cohesion, the volume gained
-// before. Out: H, the volume gained.
+// before.
+template <class V>
+struct ConeTrial : Trial<V> {
+  V trace;  // of the strain from the tip, the volume gained given back
+  BitsOf<V> cone;
+};
+template <class V>
+inline ConeTrial<V> cone_return(const V* in) {
+  const V slope = in[9], apex = in[10], gained = in[11], zero = {};
+  ConeTrial<V> t{trial_state(in), {}, {}};
+  t.trace = t.e[0] + t.e[1] + t.e[2] + gained - 3 * apex;
+  const V excess = t.norm + slope * t.trace;
+  const auto tip = t.trace > 0;
+  t.yields = (tip | (excess > 0)) & t.upright, t.cone = t.yields & ~tip;
+  for (int i = 0; i < 3; ++i) {
+    const V moved = t.e[i] + (gained / 3 - apex);
+    const V flowed = (tip ? zero : moved - excess * t.n[i]) + apex - t.e[i];
+    t.delta[i] = t.yields ? flowed : (t.upright ? gained / 3 : zero);
+  }
+  return t;
+}
+
+// Out: H, the plastic strain increment.
+template <class V>
+inline void von_mises(const V* in, V* out) {
+  const auto t = radial_return(in);
+  flow_along(t.s, t.delta, in, out);
+  out[9] = t.yields ? t.norm - in[9] / (2 * in[10]) : V{};
+}
+
+// Out: H, the volume gained.
 template <class V>
 inline void drucker_prager(const V* in, V* out) {
-  const V slope = in[9], apex = in[10], gained = in[11], zero = {}, one = zero + 1;
-  V b[6], e[3], moved[3], delta[3];
-  left_strain(in, b);
-  const V change = volume_change(in);
-  const auto s = principal_stretches(b, change);
-  log_stretches(s, e);
-  for (int i = 0; i < 3; ++i) moved[i] = e[i] + (gained / 3 - apex);
-  const V trace = moved[0] + moved[1] + moved[2], mean = trace / 3;
-  V square = zero;
-  for (int i = 0; i < 3; ++i) square += (moved[i] - mean) * (moved[i] - mean);
-  const V norm = root(square), excess = norm + slope * trace;
-  const auto tip = trace > 0, yields = tip | (excess > 0), upright = change > -1;
-  V sum = zero;
-  for (int i = 0; i < 3; ++i) {
-    const V returned = moved[i] - excess * (moved[i] - mean) / (norm > 0 ? norm : one);
-    const V flowed = (tip ? zero : returned) + apex;
-    const V target = yields ? flowed : e[i] + gained / 3;
-    delta[i] = upright ? target - e[i] : zero;
-    sum += delta[i];
-  }
-  flow_along(s, delta, in, out);
-  out[9] = upright ? (yields ? gained - sum : zero) : gained;
+  const V zero = {}, gained = in[11];
+  const auto t = cone_return(in);
+  flow_along(t.s, t.delta, in, out);
+  const V left = gained - (t.delta[0] + t.delta[1] + t.delta[2]);
+  out[9] = t.upright ? (t.yields ? left : zero) : gained;
 }
 
 }  // namespace pgjax

@@ -16,6 +16,7 @@ from pgjax.models import Material
 from pgjax.scene import Scene
 from pgjax.scenes.build import Plan
 from pgjax.state import State
+from pgjax.step import in_native_stages
 
 
 def summary(plan: Plan) -> str:
@@ -92,17 +93,20 @@ def needed_memory(scene: Scene, state: State) -> Memory:
     """What the simulation takes, without drawing and without derivatives.
 
     The state is there three times: before the frame, after it, and between two steps. A node has
-    mass and momentum, which the sweep takes, and twice the velocity it returns. Native transfers
+    mass and momentum, which a sweep of conditions takes, and twice what it returns. Native transfers
     hold the payload of each particle; in plain JAX a particle has its window of nodes and three
-    rows of weights for each node of a direction.
+    rows of weights for each node of a direction. Native stages work in place: a state before and
+    one after, nodes of four numbers (in the plane a copy of them without the fourth), positions.
     """
     d, k, number = scene.grid.dimension, scene.spline.width, state.dtype.itemsize
-    particle, node = d + 1 + 2 * d * d + d, 2 + 3 * d
+    states, particle, node = 3, d + 1 + 2 * d * d + d, 2 + 3 * d if scene.boundaries else 2 * d
     if not native.available():
         particle = k**d * (d + 1) + 3 * k * d + (d + 1) * (1 + 2 * d)
+    if in_native_stages(scene, state):
+        states, particle, node = 2, d, 4 if d == 3 else 8
     return Memory(
         scene=_bytes(scene),
-        state=3 * _bytes(state),
+        state=states * _bytes(state),
         grid=math.prod(scene.grid.padded_shape) * node * number,
         transfers=scene.particle_count * particle * number,
     )
