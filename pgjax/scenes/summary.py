@@ -93,8 +93,8 @@ def needed_memory(scene: Scene, state: State) -> Memory:
     """What the simulation takes, without drawing and without derivatives.
 
     The state is there three times: before the frame, after it, and between two steps. A node has
-    mass and momentum, which a sweep of conditions takes, and twice what it returns. Native transfers
-    hold the payload of each particle; in plain JAX a particle has its window of nodes and three
+    mass and momentum, which a sweep of conditions takes, and twice what it returns. Native
+    transfers hold the payload of each particle; in plain JAX a particle has its window of nodes and three
     rows of weights for each node of a direction. Native stages work in place: a state before and
     one after, nodes of four numbers (in the plane a copy of them without the fourth), positions.
     """
