@@ -92,11 +92,12 @@ class Memory(NamedTuple):
 def needed_memory(scene: Scene, state: State) -> Memory:
     """What the simulation takes, without drawing and without derivatives.
 
-    The state is there three times: before the frame, after it, and between two steps. A node has
-    mass and momentum, which a sweep of conditions takes, and twice what it returns. Native
-    transfers hold the payload of each particle; in plain JAX a particle has its window of nodes and three
-    rows of weights for each node of a direction. Native stages work in place: a state before and
-    one after, nodes of four numbers (in the plane a copy of them without the fourth), positions.
+    The state is there three times: before the frame, after it, and between two steps. A node
+    has mass and momentum, which a sweep of conditions takes, and twice what it returns. Native
+    transfers hold the payload of each particle; in plain JAX a particle has its window of nodes
+    and three rows of weights for each node of a direction. Native stages work in place: a state
+    before and one after, nodes of four numbers (in the plane a copy of them without the
+    fourth), positions.
     """
     d, k, number = scene.grid.dimension, scene.spline.width, state.dtype.itemsize
     states, particle, node = 3, d + 1 + 2 * d * d + d, 2 + 3 * d if scene.boundaries else 2 * d
