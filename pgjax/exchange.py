@@ -522,7 +522,7 @@ def velocities(
     """
     numbers = jnp.concatenate([kept[None], gained])
     contact, sides = (None, []) if walls is None else walls
-    friction = contact.friction if isinstance(contact, Separating) else jnp.zeros(())
+    friction = contact.friction if isinstance(contact, Separating) else jnp.zeros((), nodes.dtype)
     padded = [*sides, *[jnp.zeros((0,), jnp.int8)] * (3 - len(sides))]
     name = _CONTACTS[_CONTACT_TYPES.index(type(contact))]
     return _velocities(*padded, nodes, numbers, friction[None], contact=name)[0]
