@@ -1,4 +1,4 @@
-"""The command line: `pgjax run`, `pgjax view` and `pgjax info`."""
+"""The command line: `pgjax run`, `pgjax fit`, `pgjax view` and `pgjax info`."""
 
 import argparse
 import os
@@ -91,6 +91,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument("--no-open", action="store_true", help="open no browser")
     view.set_defaults(command=_view)
+
+    fit = commands.add_parser("fit", help="find parameters of a scene from what was recorded of it")
+    fit.add_argument("case", type=Path, help="a case file (.toml)")
+    fit.add_argument(
+        "--data",
+        type=Path,
+        help="a video, a folder of numbered pictures or an .npz, in place of the case's own",
+    )
+    fit.add_argument("--out", type=Path, help="output folder, new or empty (default: out/NAME)")
+    fit.add_argument(
+        "--dry-run", action="store_true", help="check everything, say what it costs, write nothing"
+    )
+    fit.set_defaults(command=_fit)
 
     info = commands.add_parser("info", help="print versions, devices and what will be used")
     info.set_defaults(command=_info)
@@ -211,6 +224,30 @@ def _folders(name: str) -> Iterator[Path]:
         yield folder
         number += 1
         folder = folder.with_name(f"{name}-{number}")
+
+
+def _fit(options: argparse.Namespace) -> int:
+    from pgjax.cases import prepare, read_case, solve
+    from pgjax.scenes.record import require_empty
+
+    if options.out is not None:
+        require_empty(options.out)
+    case = read_case(options.case, options.data)
+    folder = options.out or _next_folder(case.name)
+    prepared = prepare(case)
+    problem = prepared.problem
+    for note in prepared.notes:
+        print(f"warning: {note}", file=sys.stderr)
+    print(
+        f"fit        {', '.join(problem.names)} to {problem.frames} frames, "
+        f"{prepared.plan.scene.particle_count} particles, {problem.substeps} steps a frame"
+    )
+    if options.dry_run:
+        return 0
+    found, report = solve(prepared, folder, report=lambda line: print(line, flush=True))
+    print(found.summary())
+    print(f"wrote      {report}")
+    return 0
 
 
 def _view(options: argparse.Namespace) -> int:

@@ -166,7 +166,8 @@ def _rollout(
         state = note_frame(scene, state, dt)
         if report is not None:
             jax.debug.callback(functools.partial(_call, report), index, frames)
-        return state, jax.checkpoint(save)(state)
+        # A function of its own: `save` may be a module that holds traced arrays.
+        return state, jax.checkpoint(lambda s: save(s))(state)
 
     state = note_start(scene, state, dt)
     first = save(state)

@@ -57,7 +57,17 @@ def test_rendering(tmp_path):
     np.testing.assert_allclose(lengths, 1, atol=1e-3)
 
 
-PAGES = ("conventions", "design", "extend", "rendering", "scene-files", "viewer")
+def test_identification():
+    names = run_blocks(ROOT / "docs" / "identification.md")
+    for found in (names["found"], names["staged"]):
+        np.testing.assert_allclose(found.values["E"], 2e4, rtol=0.1)
+    interval = names["interval"]
+    assert interval.low < 2e4 < interval.high
+    history = names["trained"].history
+    assert names["trained"].cost < 0.5 * history[0].cost
+
+
+PAGES = ("conventions", "design", "extend", "identification", "rendering", "scene-files", "viewer")
 
 
 @pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])

@@ -103,7 +103,7 @@ def particle_axes(tree: Any, count: int) -> Any:
         ValueError: if a parameter is neither one number nor `count` numbers.
     """
     axes = jax.tree.map(lambda _: None, tree)
-    for path, rank in _parameter_paths(tree):
+    for path, rank in parameter_paths(tree):
         value = _follow(tree, path)
         if value is None or value.ndim == rank:
             continue
@@ -120,7 +120,7 @@ def particle_axes(tree: Any, count: int) -> Any:
     return axes
 
 
-def _parameter_paths(tree: Any, prefix: tuple[str, ...] = ()) -> list[tuple[tuple[str, ...], int]]:
+def parameter_paths(tree: Any, prefix: tuple[str, ...] = ()) -> list[tuple[tuple[str, ...], int]]:
     """Names of all fields declared with `parameter()` in a tree of modules, and their ranks."""
     if not isinstance(tree, eqx.Module):
         return []
@@ -130,7 +130,7 @@ def _parameter_paths(tree: Any, prefix: tuple[str, ...] = ()) -> list[tuple[tupl
         if is_parameter(field):
             paths.append((here, field.metadata.get("rank", 0)))
         else:
-            paths.extend(_parameter_paths(getattr(tree, field.name), here))
+            paths.extend(parameter_paths(getattr(tree, field.name), here))
     return paths
 
 

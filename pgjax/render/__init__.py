@@ -14,6 +14,8 @@ from pgjax.render.gaussians import deform as deform
 from pgjax.render.load import load_capture as load_capture
 from pgjax.render.load import load_gaussians as load_gaussians
 from pgjax.render.media import VideoWriter as VideoWriter
+from pgjax.render.media import load_image as load_image
+from pgjax.render.media import load_video as load_video
 from pgjax.render.media import save_image as save_image
 from pgjax.render.media import save_video as save_video
 from pgjax.render.needles import AxisReport as AxisReport

@@ -54,6 +54,41 @@ def load_image(path: str | os.PathLike[str]) -> np.ndarray:
     return np.asarray(imageio.imread(Path(path)), np.float64) / 255
 
 
+def load_video(path: str | os.PathLike[str], most: int | None = None) -> tuple[float, np.ndarray]:
+    """Frames per second of a video, and its first `most` frames, `(n, height, width, 3)` uint8.
+
+    Raises:
+        ValueError: the file is not a video.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise ValueError(f"Argument `path` must name a file, but there is no {file}.")
+    # Its header has size and rate in numbers, `YUV4MPEG2 W640 H480 F25:1 …`.
+    header = _decoded(file, ["-frames:v", "1", "-f", "yuv4mpegpipe"]).partition(b"\n")[0]
+    facts = {word[:1]: word[1:] for word in header.decode("ascii", "replace").split()[1:]}
+    if not {"W", "H", "F"} <= set(facts):
+        raise ValueError(f"The file {file} is not a video that ffmpeg can read.")
+    width, height = int(facts["W"]), int(facts["H"])
+    number, _, by = facts["F"].partition(":")
+    limit = [] if most is None else ["-frames:v", str(most)]
+    raw = _decoded(file, [*limit, "-f", "rawvideo", "-pix_fmt", "rgb24"])
+    frames = np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+    return int(number) / int(by), frames
+
+
+def _decoded(file: Path, options: list[str]) -> bytes:
+    """What ffmpeg makes of a video; nothing where it can make nothing of it."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(file)]
+    done = subprocess.run(
+        [*command, *options, "-"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        check=False,
+    )
+    return done.stdout
+
+
 def save_video(
     path: str | os.PathLike[str], frames: Iterable[ArrayLike], *, fps: float | int
 ) -> None:

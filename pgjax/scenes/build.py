@@ -14,6 +14,7 @@ from pgjax.scenes.camera import CameraPart
 from pgjax.scenes.capture import body
 from pgjax.scenes.conditions import ParticlesPart
 from pgjax.scenes.crowd import Crowd, by_material
+from pgjax.scenes.model import ModelPart
 from pgjax.scenes.reader import SceneError, naming
 from pgjax.scenes.schema import GridPart, SceneFile
 from pgjax.scenes.walls import BoundaryPart, Site
@@ -40,6 +41,8 @@ class Plan:
         fps: frames per second.
         view: the camera's part of the scene file.
         notes: what was found in the models and done to them, a line each.
+        models: of the scene file.
+        body: of which model each particle is, `(n,)`.
     """
 
     name: str
@@ -54,6 +57,8 @@ class Plan:
     fps: float
     view: CameraPart
     notes: tuple[str, ...] = ()
+    models: tuple[ModelPart, ...] = ()
+    body: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
 
     def camera(self, frame: int) -> Camera:
         """The camera of a frame."""
@@ -103,6 +108,8 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         fps=file.time.fps,
         view=file.camera,
         notes=tuple(note for b in bodies for note in b.notes),
+        models=file.models,
+        body=crowd.body,
     )
 
 

@@ -171,6 +171,15 @@ class Table:
             raise self.error(key, "be a list of whole numbers")
         return tuple(value)
 
+    def texts(self, key: str, default: Any = REQUIRED) -> Any:
+        """A list of strings."""
+        value = self._take(key, default)
+        if key not in self._data:
+            return value
+        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+            raise self.error(key, "be a list of strings")
+        return tuple(value)
+
     def choice(self, key: str, choices: Mapping[str, T], default: Any = REQUIRED) -> T:
         """What a name stands for."""
         name = self.text(key, default)

@@ -1,0 +1,56 @@
+"""How well, how surely and how fast parameters are found: the cases of the literature.
+
+    python -m benchmarks.identification [--cases NAME …] [--tiers self cross] [--views N]
+
+prints one table and writes it to `benchmarks/results/identification_cpu.json` and `.md`; rows of
+cases that were not run now are kept. In the tier "self" the data are made with the estimator's
+own discretisation, in the tier "cross" with other particles, spacing / 1.5 and half the time step.
+Each case runs in a process of its own.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from benchmarks.identification import report
+from benchmarks.identification.cases import all_cases
+
+RESULTS = Path(__file__).parents[1] / "results"
+
+
+def main() -> int:
+    """Run the cases and store what came out."""
+    cases = all_cases()
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--cases", nargs="+", default=list(cases), choices=list(cases))
+    parser.add_argument("--tiers", nargs="+", default=["self", "cross"], choices=["self", "cross"])
+    parser.add_argument("--views", type=int, default=1, help="cameras of the picture cases")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    target = options.out / "identification_cpu.json"
+    known = json.loads(target.read_text())["rows"] if target.exists() else []
+    rows = {(row["case"], row["tier"]): row for row in known}
+    for name in options.cases:
+        for tier in options.tiers:
+            row = _run(name, tier, options.views, cases[name].double)
+            rows[name, tier] = row
+            print(report.line(row), flush=True)
+            ordered = [rows[n, t] for n in cases for t in ("self", "cross") if (n, t) in rows]
+            report.write(options.out, ordered)
+    return 0
+
+
+def _run(name: str, tier: str, views: int, double: bool) -> dict:
+    command = [sys.executable, "-m", "benchmarks.identification.worker", name, tier, str(views)]
+    env = {**os.environ, "JAX_ENABLE_X64": str(int(double)), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(command, env=env, stdout=subprocess.PIPE, text=True)
+    if done.returncode:
+        return {"case": name, "tier": tier, "error": f"exit status {done.returncode}"}
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

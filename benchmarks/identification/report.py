@@ -1,0 +1,82 @@
+"""The stored results: JSON, and the same as Markdown."""
+
+import json
+import os
+import platform
+from pathlib import Path
+
+import jax
+
+COMMAND = "python -m benchmarks.identification"
+
+
+def line(row: dict) -> str:
+    """A row, for the terminal."""
+    head = f"{row['case']} ({row['tier']})"
+    if "error" in row:
+        return f"{head}: {row['error']}"
+    parts = [
+        f"{e['name']} {e['estimate']:.5g} (error {e['error']:.2g} {e['scale']}"
+        + ("" if e["met"] is None else ", met" if e["met"] else f", demanded {e['demand']:g}")
+        + f"; {e['verdict']})"
+        for e in row["estimates"]
+    ]
+    return f"{head}: {', '.join(parts)}; {row['trials']} points, {row['seconds']:.0f} s"
+
+
+def write(folder: Path, rows: list[dict]) -> None:
+    """Both files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    machine = {
+        "machine": platform.machine(),
+        "threads": len(os.sched_getaffinity(0)),
+        "jax": jax.__version__,
+        "command": COMMAND,
+    }
+    (folder / "identification_cpu.json").write_text(
+        json.dumps({**machine, "rows": rows}, indent=1) + "\n"
+    )
+    (folder / "identification_cpu.md").write_text(_markdown(machine, rows))
+
+
+def _markdown(machine: dict, rows: list[dict]) -> str:
+    lines = [
+        "# Identification",
+        "",
+        f"`{COMMAND}`; {machine['machine']}, {machine['threads']} threads, JAX {machine['jax']}. "
+        "Tier *self*: data made with the estimator's own discretisation. Tier *cross*: other "
+        "particles, spacing / 1.5, half the time step. Errors in decades (log10), as a part of the "
+        "truth (relative), or absolute. Intervals are 95 %; *mismatch* is the derivative against "
+        "the secant over the interval.",
+        "",
+        "| case | tier | unknown | truth | estimate | error | demanded | met | 95 % interval | "
+        "mismatch | verdict |",
+        "|---|---|---|---:|---:|---:|---:|---|---|---:|---|",
+    ]
+    for row in rows:
+        if "error" in row:
+            lines.append(f"| {row['case']} | {row['tier']} | {row['error']} |" + " |" * 8)
+            continue
+        for e in row["estimates"]:
+            demand = "" if e["demand"] is None else f"{e['demand']:g} {e['scale']}"
+            met = {None: "", True: "yes", False: "**no**"}[e["met"]]
+            lines.append(
+                f"| {row['case']} | {row['tier']} | {e['name']} | {e['truth']:.5g} | "
+                f"{e['estimate']:.6g} | {e['error']:.2g} | {demand} | {met} | "
+                f"{e['low']:.5g} … {e['high']:.5g}{'' if e['covers'] else ' (truth outside)'} | "
+                f"{e['mismatch']:.1%} | {e['verdict']} |"
+            )
+    lines += [
+        "",
+        "| case | tier | cameras | particles | steps | tried | tried on the whole |"
+        " simulations | seconds | ended |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---|",
+    ]
+    lines += [
+        f"| {r['case']} | {r['tier']} | {r['views'] or 'positions'} | {r['particles']} | "
+        f"{r['steps']} | {r['trials']} | {r['last_descent']} | {r['simulations']} | "
+        f"{r['seconds']:.0f} | {r['reason']} |"
+        for r in rows
+        if "error" not in r
+    ]
+    return "\n".join(lines) + "\n"

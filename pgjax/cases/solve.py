@@ -1,0 +1,188 @@
+"""From a case file to a fit, a report and the fitted scene file."""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+
+from pgjax._files import replacing
+from pgjax.cases.footage import Footage, footage, track
+from pgjax.cases.report import Comparison, write_report
+from pgjax.cases.schema import CaseFile, fitted_content
+from pgjax.cases.unknowns import Building, place
+from pgjax.inverse import Fit, Pictures, Positions, Problem, fit
+from pgjax.inverse.observations import AbstractObservation
+from pgjax.render import Camera
+from pgjax.result import SimulationWarning
+from pgjax.scenes import Plan, SceneError, plan
+
+# The first pictures are that of the scene at rest up to this (root mean square of a pixel).
+_ALIKE = 0.15
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A case, ready to be solved.
+
+    Attributes:
+        case: the file.
+        plan: the scene at the numbers of its file.
+        problem: of the frames that are fitted.
+        whole: of all frames that are compared.
+        footage: of each view; empty for a track.
+        notes: what a reader of the report has to know.
+    """
+
+    case: CaseFile
+    plan: Plan
+    problem: Problem
+    whole: Problem
+    footage: tuple[Footage, ...]
+    notes: tuple[str, ...]
+
+
+def prepare(case: CaseFile) -> Prepared:
+    """Load scene and data and see that they fit together; nothing is compiled yet.
+
+    Raises:
+        SceneError: they do not.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SimulationWarning)
+        made = plan(case.scene)
+        if case.track is not None:
+            observations, films = _of_track(case, made), ()
+        else:
+            films = tuple(
+                footage(t, case.frame_rate, case.first, case.frames) for t, _ in case.views
+            )
+            observations = [
+                _of_view(case, made, film, _camera(case, made, part, t.name))
+                for film, (t, part) in zip(films, case.views, strict=True)
+            ]
+    for t, _ in case.views:
+        t.close()
+    if case.track is not None:
+        case.track.close()
+    places = tuple((u.key, place(u, made)) for u in case.unknowns)
+    whole = Problem(
+        {u.key: u.parameter for u in case.unknowns},
+        Building(made.scene, made.state, places),
+        observations,
+        frame_dt=1 / case.frame_rate,
+        frames=case.frames,
+    )
+    notes = [str(w.message) for w in caught] + _first_look(whole, films)
+    return Prepared(case, made, whole.until(case.fit_frames), whole, films, tuple(notes))
+
+
+def _camera(case: CaseFile, made: Plan, part, label: str) -> Camera:
+    """The camera of a view, which has to stand still."""
+    view = made.view.view if part is None else part.view
+    first, last = (
+        view.at(frame / case.frame_rate, made.to_simulation) for frame in (0, case.frames)
+    )
+    pairs = zip(jax.tree.leaves(first), jax.tree.leaves(last), strict=True)
+    if not all(np.array_equal(a, b) for a, b in pairs):
+        raise SceneError(f"{label}: the camera must stand still, but moves between the frames.")
+    return first
+
+
+def _of_view(case: CaseFile, made: Plan, film: Footage, camera: Camera) -> AbstractObservation:
+    height, width = film.pictures.shape[1:3]
+    if (height, width) != (camera.height, camera.width):
+        raise SceneError(
+            f"{film.label}: the pictures must have the size of the camera, {camera.width} × "
+            f"{camera.height}, but have {width} × {height}: give the camera their `width` and "
+            "`height`."
+        )
+    data = film.pictures if case.channel == "rgb" else film.pictures.mean(axis=-1)
+    return Pictures(
+        made.moving,
+        camera,
+        data,
+        channel="rgb" if case.channel == "rgb" else "silhouette",
+        background=made.view.background,
+        frames=film.numbers.tolist(),
+        sigma=case.noise,
+        still=made.still if len(made.still) else None,
+    )
+
+
+def _of_track(case: CaseFile, made: Plan) -> list[AbstractObservation]:
+    assert case.track is not None
+    found = track(case.track, made.scene.particle_count)
+    kept = found.numbers <= case.frames
+    return [
+        Positions(
+            found.x[kept],
+            frames=found.numbers[kept].tolist(),
+            particles=found.particles,
+            sigma=case.noise,
+        )
+    ]
+
+
+def _first_look(problem: Problem, films: tuple[Footage, ...]) -> list[str]:
+    """Whether the first picture of each view looks like the scene at rest."""
+    notes = []
+    _, state = problem.build(problem.space.values(problem.space.start))
+    for film, observation in zip(films, problem.observations, strict=bool(films)):
+        if film.numbers[0] != 0:
+            continue
+        assert isinstance(observation, Pictures)
+        seen, data = np.asarray(observation.see(state)), np.asarray(observation.data[0])
+        off = float(np.sqrt(np.mean((seen - data) ** 2)))
+        if off > _ALIKE:
+            notes.append(
+                f"{film.label}: the first picture does not look like the scene at rest (root mean "
+                f"square difference {off:.2f}): is it another camera, or another model?"
+            )
+    return notes
+
+
+def solve(
+    prepared: Prepared, out: Path, *, report: Callable[[str], None] | None = None
+) -> tuple[Fit, Path]:
+    """Fit, and write `report.md`, its pictures and `fitted.toml` into a folder.
+
+    Returns:
+        The fit and the path of the report.
+    """
+    case = prepared.case
+    settings = case.solver
+    found = fit(
+        prepared.problem,
+        stages=settings.stages,
+        starts=settings.starts,
+        trials=settings.trials,
+        tolerance=settings.tolerance,
+        report=report,
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    content = fitted_content(case, {n: found.values[n] for n in found.problem.space.free})
+    with replacing(out / "fitted.toml") as temporary:
+        temporary.write_bytes(tomli_w.dumps(content).encode())
+    comparisons = _compared(prepared, found)
+    return found, write_report(out, case, found, comparisons, prepared.notes)
+
+
+def _compared(prepared: Prepared, found: Fit) -> list[Comparison]:
+    """What every observation shows of all frames, beside what is predicted."""
+    whole = prepared.whole
+    u = jnp.asarray(whole.space.vector({n: found.values[n] for n in whole.space.free}))
+    saved, _ = whole.see(u.astype(jnp.zeros(()).dtype))
+    made = []
+    for seen, o in zip(saved, whole.observations, strict=True):
+        frames = np.asarray(o.frames)
+        made.append(
+            Comparison(
+                frames, np.asarray(o.data), np.asarray(seen)[frames], isinstance(o, Pictures)
+            )
+        )
+    return made

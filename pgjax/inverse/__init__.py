@@ -1,0 +1,29 @@
+"""Identification: what a motion says about the material that made it, and how surely."""
+
+from pgjax.inverse.checking import GradientCheck as GradientCheck
+from pgjax.inverse.checking import gradient_check as gradient_check
+from pgjax.inverse.descent import Descended as Descended
+from pgjax.inverse.descent import descend as descend
+from pgjax.inverse.descent import descend_problem as descend_problem
+from pgjax.inverse.fitting import Fit as Fit
+from pgjax.inverse.fitting import Stage as Stage
+from pgjax.inverse.fitting import fit as fit
+from pgjax.inverse.information import Profile as Profile
+from pgjax.inverse.information import information as information
+from pgjax.inverse.information import profile as profile
+from pgjax.inverse.information import would_help as would_help
+from pgjax.inverse.levenberg import FitError as FitError
+from pgjax.inverse.losses import Cauchy as Cauchy
+from pgjax.inverse.losses import Huber as Huber
+from pgjax.inverse.matching import Chamfer as Chamfer
+from pgjax.inverse.matching import Sinkhorn as Sinkhorn
+from pgjax.inverse.observations import AbstractObservation as AbstractObservation
+from pgjax.inverse.observations import Cloud as Cloud
+from pgjax.inverse.observations import Pictures as Pictures
+from pgjax.inverse.observations import Positions as Positions
+from pgjax.inverse.parameters import Parameter as Parameter
+from pgjax.inverse.parameters import moduli as moduli
+from pgjax.inverse.problem import Problem as Problem
+from pgjax.inverse.uncertainty import Interval as Interval
+from pgjax.inverse.uncertainty import Uncertainty as Uncertainty
+from pgjax.inverse.uncertainty import uncertainty as uncertainty

@@ -1,0 +1,270 @@
+"""Fitting: stages, several starts, the estimate and everything that was tried on the way."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, final
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import qmc
+
+from pgjax.inverse.levenberg import (
+    Descent,
+    FitError,
+    Point,
+    Trial,
+    levenberg_marquardt,
+)
+from pgjax.inverse.problem import Problem, outcomes
+from pgjax.inverse.uncertainty import Uncertainty, uncertainty
+
+# Starts that are simulated at once, and how many of them are followed to their end.
+_AT_ONCE, _FOLLOWED = 8, 3
+
+
+class Stage(NamedTuple):
+    """Part of a fit: some parameters, from what was recorded up to a frame.
+
+    Attributes:
+        frames: last frame; all if None. A short horizon first keeps a fit out of local minima.
+        free: names of the parameters; all that are free in the problem if None. Initial
+            velocities, say, from the frames before a contact.
+    """
+
+    frames: int | None = None
+    free: tuple[str, ...] | None = None
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """The result of `fit`.
+
+    Attributes:
+        problem: what was solved.
+        values: the estimate by name, in physical units; fixed parameters too.
+        point: the estimate in free coordinates, with its residual and derivative.
+        start: the first guess, in free coordinates.
+        trials: every point that was tried, in order, over all stages and starts.
+        others: ends of the other starts that were followed, the best first.
+        converged: whether the last stage ended because nothing was left to gain.
+        reason: why it ended.
+        uncertainty: covariance and intervals; None if it was not asked for.
+        messages: what a reader has to know: bounds that were met, what is not identifiable.
+        simulations: number of forward runs, a tangent counted as one.
+        seconds: wall time, compiling included.
+    """
+
+    problem: Problem
+    values: dict[str, np.ndarray]
+    point: Point
+    start: np.ndarray
+    trials: list[Trial]
+    others: list[Point]
+    converged: bool
+    reason: str
+    uncertainty: Uncertainty | None
+    messages: list[str]
+    simulations: int
+    seconds: float
+
+    @property
+    def iterations(self) -> int:
+        """Points that were tried after the first of each descent."""
+        return len(self.trials)
+
+    def summary(self) -> str:
+        """Estimates with intervals, as a table of text."""
+        lines = [f"{'parameter':14} {'estimate':>12}  {'95 % interval':28} verdict"]
+        for name, value, unit in self.rows():
+            text = f"{name:14} {value:12.6g}"
+            if self.uncertainty is not None:
+                interval = self.uncertainty.interval(name)
+                span = f"[{interval.low:.6g}, {interval.high:.6g}] {unit}"
+                text += f"  {span:28} {interval.verdict}"
+                if interval.why:
+                    text += f": {interval.why}"
+            lines.append(text)
+        return "\n".join([*lines, *self.messages])
+
+    def rows(self) -> list[tuple[str, float, str]]:
+        """Name, estimate and unit of each free coordinate."""
+        rows = []
+        place = 0
+        names = self.problem.names
+        for name, parameter in self.problem.space.free.items():
+            for value in np.ravel(self.values[name]):
+                rows.append((names[place], float(value), parameter.unit))
+                place += 1
+        return rows
+
+
+def fit(
+    problem: Problem,
+    *,
+    stages: Sequence[Stage] = (),
+    starts: int = 1,
+    trials: int = 30,
+    tolerance: float = 1e-6,
+    intervals: bool = True,
+    noise_known: bool = False,
+    seed: int = 0,
+    report: Callable[[str], None] | None = None,
+) -> Fit:
+    """Find the parameters by Levenberg–Marquardt with exact derivatives in forward mode.
+
+    Args:
+        problem: what to solve.
+        stages: done in this order before the whole problem; each starts where the last one ended.
+        starts: with more than one, that many points of a low-discrepancy sequence within the bounds
+            (a power of two is best) are simulated at once, and the best three of them and the first
+            guess are followed. Every free parameter then needs both bounds.
+        trials: how many points each descent tries at most.
+        tolerance: of the free coordinates, at which a descent ends; 1e-6 of a logarithm.
+        intervals: compute the uncertainty, two more simulations per coordinate.
+        noise_known: take the noise given for the data as it is instead of estimating it.
+        seed: of the starts.
+        report: called with a line of text after each trial.
+
+    Raises:
+        FitError: no start can be used; the message says why.
+        ValueError: an argument is out of range.
+    """
+    began = time.perf_counter()
+    if starts < 1 or trials < 1 or not tolerance > 0:
+        raise ValueError(
+            "Arguments `starts` and `trials` must be at least 1 and `tolerance` positive, but are "
+            f"{starts}, {trials}, {tolerance}."
+        )
+    run = _Run(problem, trials, tolerance, report)
+    guesses = [problem.space.start]
+    if starts > 1:
+        guesses = run.screened(starts, seed)
+    ends: list[Descent] = []
+    failures: list[FitError] = []
+    for guess in guesses:
+        try:
+            ends.append(run.follow(guess, stages))
+        except FitError as error:
+            failures.append(error)
+    if not ends:
+        raise failures[0]
+    ends.sort(key=lambda end: end.best.cost)
+    best, *others = ends
+    found = None
+    if intervals:
+        found = uncertainty(problem, best.best, noise_known=noise_known)
+        run.simulations += 2 * problem.space.size
+    return Fit(
+        problem=problem,
+        values=problem.space.known(best.best.u),
+        point=best.best,
+        start=problem.space.start,
+        trials=run.trials,
+        others=[end.best for end in others],
+        converged=best.converged,
+        reason=best.reason,
+        uncertainty=found,
+        messages=_messages(problem, best, others, failures),
+        simulations=run.simulations,
+        seconds=time.perf_counter() - began,
+    )
+
+
+class _Run:
+    """Counts what is simulated, and keeps what was tried."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        most: int,
+        tolerance: float,
+        report: Callable[[str], None] | None,
+    ):
+        self.problem, self.most, self.tolerance = problem, most, tolerance
+        self.report = report
+        self.trials: list[Trial] = []
+        self.simulations = 0
+        self._began = time.perf_counter()
+
+    def screened(self, starts: int, seed: int) -> list[np.ndarray]:
+        """The first guess and the best of several starts."""
+        space = self.problem.space
+        lower, upper = space.bounds()
+        for name, low, high in zip(space.names, lower, upper, strict=True):
+            if not np.isfinite(low) or not np.isfinite(high):
+                raise ValueError(
+                    f"Argument `starts` must be 1 unless every free parameter has both bounds, but "
+                    f"{name!r} has none on one side."
+                )
+        spread = qmc.Sobol(space.size, rng=seed).random_base2(int(np.ceil(np.log2(starts))))
+        points = lower + spread[:starts] * (upper - lower)
+        points = np.concatenate([space.start[None], points])
+        result = outcomes(
+            self.problem, jnp.asarray(points, jnp.zeros(()).dtype), min(_AT_ONCE, len(points))
+        )
+        self.simulations += len(points)
+        costs = np.where(np.asarray(result.ok), np.asarray(result.cost), np.inf)
+        order = [0, *(1 + np.argsort(costs[1:])[:_FOLLOWED])]
+        return [points[k] for k in order if np.isfinite(costs[k])] or [space.start]
+
+    def follow(self, guess: np.ndarray, stages: Sequence[Stage]) -> Descent:
+        """Through the stages, then the whole problem."""
+        space = self.problem.space
+        u = guess
+        for stage in stages:
+            part = self.problem if stage.frames is None else self.problem.until(stage.frames)
+            values = space.known(u)
+            if stage.free is not None:
+                part = part.freeing(stage.free, values)
+            own = part.space.vector({n: values[n] for n in part.space.free})
+            values = part.space.known(self._descend(part, own).best.u)
+            u = space.vector({n: values[n] for n in space.free})
+        return self._descend(self.problem, u)
+
+    def _descend(self, problem: Problem, u: np.ndarray) -> Descent:
+        def told(trial: Trial) -> None:
+            self.simulations += 1 + problem.space.size
+            seconds = time.perf_counter() - self._began
+            self.trials.append(trial._replace(seconds=seconds))
+            if self.report is not None:
+                self.report(_line(problem, trial, seconds))
+
+        return levenberg_marquardt(
+            problem, u, trials=self.most, tolerance=self.tolerance, report=told
+        )
+
+
+def _line(problem: Problem, trial: Trial, seconds: float) -> str:
+    values = problem.space.known(trial.u)
+    shown = ", ".join(
+        f"{name} {np.array2string(values[name], precision=5)}"
+        for name, parameter in problem.space.free.items()
+        if parameter.start.size <= 6
+    )
+    note = "" if trial.taken else f" (rejected: {trial.note})"
+    return f"{seconds:7.1f} s  cost {trial.cost:.6g}  {shown}{note}"
+
+
+def _messages(
+    problem: Problem, best: Descent, others: list[Descent], failures: list[FitError]
+) -> list[str]:
+    """What a reader of the estimate has to know."""
+    messages = []
+    if not best.converged:
+        messages.append(f"The fit did not converge: {best.reason}.")
+    lower, upper = problem.space.bounds()
+    for name, u, low, high in zip(problem.names, best.best.u, lower, upper, strict=True):
+        for bound, side in ((low, "lower"), (high, "upper")):
+            if abs(u - bound) <= 1e-9 * max(1.0, abs(bound)):
+                messages.append(
+                    f"{name} ended on its {side} bound: the data ask for a value beyond it."
+                )
+    messages += best.best.status.messages()
+    rivals = [end for end in others if end.best.cost <= 1.05 * best.best.cost]
+    far = [e for e in rivals if np.abs(e.best.u - best.best.u).max() > 0.05]
+    if far:
+        messages.append(f"{len(far)} other start(s) ended elsewhere with a cost as low.")
+    messages += [f"A start could not be used: {error}" for error in failures]
+    return messages

@@ -1,0 +1,310 @@
+"""An identification problem: unknowns, the simulation they give, and what was recorded of it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pgjax._types import Array, Bool, Float, positive, require
+from pgjax.inverse.observations import AbstractObservation
+from pgjax.inverse.parameters import Parameter, Space, Values
+from pgjax.result import Status
+from pgjax.scene import Scene
+from pgjax.simulate import simulate
+from pgjax.state import State
+from pgjax.timestep import ELASTIC_FRACTION, stable_dt, substeps_for
+
+Build = Callable[[Values], tuple[Scene, State]]
+
+# Directions of the Jacobian that are computed at once.
+_DIRECTIONS = 8
+
+
+class Outcome(NamedTuple):
+    """One simulation against the data.
+
+    Attributes:
+        residual: differences over their noise, then those of the priors, `(m,)`.
+        status: what happened in the simulation.
+    """
+
+    residual: Float[Array, "*batch m"]
+    status: Status
+
+    @property
+    def cost(self) -> Float[Array, "*batch"]:
+        """Half the squared sum of the residual."""
+        return jnp.sum(self.residual**2, axis=-1) / 2
+
+    @property
+    def ok(self) -> Bool[Array, "*batch"]:
+        """Whether no particle was lost and the residual is finite."""
+        return self.status.ok & jnp.all(jnp.isfinite(self.residual), axis=-1)
+
+
+@final
+class Problem(eqx.Module):
+    """Which parameters make the simulation look like the data.
+
+    The time step is decided once, for the stiffest scene the bounds allow, and is the same for
+    every start, step and solver.
+
+    Args:
+        parameters: the unknowns by name.
+        build: from the values by name to scene and initial state. It is traced: the number of
+            particles and the grid must not depend on the values, and what is expensive belongs
+            outside of it.
+        observations: one, or several whose residuals are put one after the other.
+        frame_dt: duration of a frame, s: one over the frame rate of the data.
+        frames: number of frames to simulate; up to the last observed one if None.
+        substeps: steps per frame; as many as the time step needs if None.
+        fraction: part of the elastic limit of the time step, as for `stable_dt`.
+
+    Raises:
+        ValueError: an argument is out of range; the time step depends on a parameter that has no
+            bound; `substeps` is too small for the stiffest scene.
+    """
+
+    space: Space
+    build: Build
+    observations: tuple[AbstractObservation, ...]
+    frame_dt: float = eqx.field(static=True)
+    frames: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Parameter],
+        build: Build,
+        observations: AbstractObservation | Sequence[AbstractObservation],
+        *,
+        frame_dt: float,
+        frames: int | None = None,
+        substeps: int | None = None,
+        fraction: float = ELASTIC_FRACTION,
+    ):
+        self.space = Space(parameters)
+        self.build = build
+        single = isinstance(observations, AbstractObservation)
+        self.observations = (observations,) if single else tuple(observations)
+        if not self.observations:
+            raise ValueError("Argument `observations` must hold at least one, but is empty.")
+        require("frame_dt", frame_dt, "be positive and finite (s)", positive)
+        self.frame_dt = float(frame_dt)
+        last = max(o.frames[-1] for o in self.observations)
+        self.frames = max(last, 1) if frames is None else int(frames)
+        if self.frames < last:
+            raise ValueError(
+                f"Argument `frames` must reach the last observed frame, {last}, but is {frames}."
+            )
+        self.substeps = _steps(self.space, build, self.frame_dt, substeps, fraction)
+
+    @property
+    def dt(self) -> float:
+        """Time step, s."""
+        return self.frame_dt / self.substeps
+
+    @property
+    def names(self) -> list[str]:
+        """Of the free coordinates."""
+        return self.space.names
+
+    def until(self, frame: int) -> "Problem":
+        """The problem of what was recorded up to a frame, with the same time step.
+
+        Raises:
+            ValueError: nothing was recorded by then.
+        """
+        kept = [part for o in self.observations if (part := o.until(frame)) is not None]
+        if not kept or frame < 1:
+            raise ValueError(
+                f"Argument `frame` must be at least 1 and not before the first observed frame, but "
+                f"is {frame}."
+            )
+        return self._with(self.space, tuple(kept), min(frame, self.frames))
+
+    def freeing(self, names: Sequence[str], values: Mapping[str, Any]) -> "Problem":
+        """The problem in which these parameters alone are free, the others fixed at `values`."""
+        unknown = sorted(set(names) - set(self.space.free))
+        if unknown:
+            raise ValueError(
+                f"Argument `names` must name free parameters ({', '.join(self.space.free)}), but "
+                f"names {', '.join(unknown)}."
+            )
+        parameters = {
+            name: p.replace(start=np.asarray(values[name]), fixed=p.fixed or name not in names)
+            for name, p in self.space.parameters.items()
+        }
+        return self._with(Space(parameters), self.observations, self.frames)
+
+    def observing(
+        self, observations: AbstractObservation | Sequence[AbstractObservation]
+    ) -> "Problem":
+        """The same unknowns and motion, observed in another way."""
+        single = isinstance(observations, AbstractObservation)
+        kept = (observations,) if single else tuple(observations)
+        frames = max(self.frames, *(o.frames[-1] for o in kept))
+        return self._with(self.space, kept, frames)
+
+    def _with(
+        self, space: Space, observations: tuple[AbstractObservation, ...], frames: int
+    ) -> "Problem":
+        """Without looking for the time step again."""
+        new = object.__new__(Problem)
+        for name, value in (
+            ("space", space),
+            ("build", self.build),
+            ("observations", observations),
+            ("frame_dt", self.frame_dt),
+            ("frames", frames),
+            ("substeps", self.substeps),
+        ):
+            object.__setattr__(new, name, value)
+        return new
+
+    def see(self, u: Float[Array, " size"]) -> tuple[tuple[Any, ...], Status]:
+        """What each observation would see of all frames at free coordinates u, and the status."""
+        scene, state = self.build(self.space.values(u))
+        trajectory = simulate(
+            scene,
+            state,
+            dt=self.dt,
+            frames=self.frames,
+            substeps=self.substeps,
+            save=_Seen(self.observations),
+            throw=False,
+            allow_unstable=True,
+        )
+        return trajectory.saved, trajectory.status
+
+    def outcome(self, u: Float[Array, " size"]) -> Outcome:
+        """Simulate at free coordinates u and compare. Pure; differentiable in u."""
+        saved, status = self.see(u)
+        parts = [o.residual(seen) for o, seen in zip(self.observations, saved, strict=True)]
+        parts = [*parts, self.space.prior_residual(u)]
+        dtype = jnp.result_type(*parts)
+        return Outcome(jnp.concatenate([part.astype(dtype) for part in parts]), status)
+
+
+@final
+class _Seen(eqx.Module):
+    observations: tuple[AbstractObservation, ...]
+
+    def __call__(self, state: State) -> tuple[Any, ...]:
+        return tuple(o.see(state) for o in self.observations)
+
+
+@eqx.filter_jit
+def outcome(problem: Problem, u: Float[Array, " size"]) -> Outcome:
+    """`problem.outcome`, compiled."""
+    return problem.outcome(u)
+
+
+@eqx.filter_jit
+def outcomes(problem: Problem, us: Float[Array, "n size"], at_once: int) -> Outcome:
+    """Of several points; the residuals are not kept, their half squared sums stand for them."""
+
+    def one(u: Array) -> Outcome:
+        result = problem.outcome(u)
+        return Outcome(jnp.sqrt(2 * result.cost)[None], result.status)
+
+    return jax.lax.map(one, us, batch_size=at_once)
+
+
+@eqx.filter_jit
+def linearised(problem: Problem, u: Float[Array, " size"]) -> tuple[Outcome, Float[Array, "p m"]]:
+    """Outcome and the rows `∂r/∂u_j`, in forward mode: one run and one tangent per coordinate."""
+    size = u.shape[0]
+
+    def push(direction: Array) -> tuple[Outcome, Array]:
+        def residual(u: Array) -> tuple[Array, Outcome]:
+            result = problem.outcome(u)
+            return result.residual, result
+
+        _, tangent, result = jax.jvp(residual, (u,), (direction,), has_aux=True)
+        return result, tangent
+
+    rows, result = [], None
+    for first in range(0, size, _DIRECTIONS):
+        directions = jnp.eye(size, dtype=u.dtype)[first : first + _DIRECTIONS]
+        result, some = jax.vmap(push, out_axes=(None, 0))(directions)
+        rows.append(some)
+    assert result is not None
+    return result, jnp.concatenate(rows)
+
+
+@eqx.filter_jit
+def cost_and_slope(
+    problem: Problem, u: Float[Array, " size"]
+) -> tuple[Outcome, Float[Array, " size"]]:
+    """Outcome and the gradient of its cost, in reverse mode through checkpointed steps."""
+
+    def cost(u: Array) -> tuple[Array, Outcome]:
+        result = problem.outcome(u)
+        return result.cost, result
+
+    slope, result = jax.grad(cost, has_aux=True)(u)
+    return result, slope
+
+
+class _Limit(NamedTuple):
+    """The time step of one scene, s: the one that is used, and the sharp one at rest."""
+
+    used: float
+    rest: float
+
+
+def _steps(
+    space: Space, build: Build, frame_dt: float, substeps: int | None, fraction: float
+) -> int:
+    """Steps per frame that are enough for the stiffest scene within the bounds."""
+
+    def limit(u: np.ndarray) -> _Limit:
+        scene, state = build(space.values(u))
+        rest = float(scene.rest_limit())
+        return _Limit(
+            stable_dt(scene, state, fraction=fraction) if substeps is None else rest, rest
+        )
+
+    worst = _stiffest(space, limit)
+    needed = substeps_for(frame_dt, limit(worst).used)
+    if substeps is None:
+        return needed
+    if isinstance(substeps, bool) or not isinstance(substeps, int | np.integer) or substeps < 1:
+        raise ValueError(f"Argument `substeps` must be a whole number ≥ 1, but is {substeps!r}.")
+    if substeps < needed:
+        at = ", ".join(f"{n} = {v}" for n, v in space.known(worst).items())
+        raise ValueError(
+            f"Argument `substeps` must be at least {needed}, for the stable time step at the "
+            f"stiffest the bounds allow ({at}), but is {substeps}."
+        )
+    return int(substeps)
+
+
+def _stiffest(space: Space, limit: Callable[[np.ndarray], _Limit]) -> np.ndarray:
+    """The corner of the bounds with the smallest time step, found coordinate by coordinate.
+
+    Exact where the limit is monotone in each coordinate, as it is in moduli and densities.
+    """
+    u = space.start.copy()
+    lower, upper = space.bounds()
+    best = limit(u)
+    for j, name in enumerate(space.names):
+        for bound, sign, side in ((lower[j], -1, "lower"), (upper[j], 1, "upper")):
+            trial = u.copy()
+            if np.isfinite(bound):
+                trial[j] = bound
+                at_bound = limit(trial)
+                if at_bound.used < best.used:
+                    u, best = trial, at_bound
+                continue
+            trial[j] += sign * 1e-2 * max(1.0, abs(trial[j]) * (not space.logarithmic[j]))
+            if limit(trial).rest < best.rest * (1 - 1e-4):
+                raise ValueError(
+                    f"Argument `{side}` of parameter {name!r} must be given: the stable time step "
+                    "depends on it, and is decided once for the stiffest scene."
+                )
+    return u

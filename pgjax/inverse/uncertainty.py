@@ -1,0 +1,231 @@
+"""How sure an estimate is: covariance, intervals, and whether the derivative may be trusted.
+
+Everything is of the free coordinates u (`parameters.Space`); intervals are given in physical units.
+"""
+
+import dataclasses
+from typing import NamedTuple, final
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from pgjax.inverse.levenberg import Point
+from pgjax.inverse.problem import Problem, outcome
+
+# A derivative that is off the secant over its own interval by more than this part is not trusted.
+LARGEST_MISMATCH = 0.2
+# A logarithm whose 95 % interval is wider than a factor of ten says nothing useful.
+WIDEST_LOGARITHM = np.log(10.0)
+# Secants over less than this are rounding (single, double precision).
+_SHORTEST = {np.dtype(np.float32): 1e-3, np.dtype(np.float64): 1e-6}
+
+
+class Interval(NamedTuple):
+    """Where a parameter is, with the probability it was asked for.
+
+    Attributes:
+        low, high: bounds in physical units; infinite or 0 where nothing bounds it.
+        mismatch: difference of derivative and secant over the 95 % interval, as a part of the
+            secant.
+        verdict: "ok", "widened" (by the secant) or "not identifiable".
+        why: what is behind the verdict.
+    """
+
+    low: float
+    high: float
+    mismatch: float
+    verdict: str
+    why: str
+
+
+class Direction(NamedTuple):
+    """A combination of parameters that is known independently of the others.
+
+    Attributes:
+        weights: of the free coordinates, a unit vector, `(p,)`.
+        deviation: standard deviation along it.
+    """
+
+    weights: np.ndarray
+    deviation: float
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Uncertainty:
+    """Covariance of an estimate, from `JᵀJ` and the noise.
+
+    Attributes:
+        names: of the coordinates.
+        u: the estimate.
+        logarithmic: which coordinates are logarithms.
+        covariance: `s² (JᵀJ)⁻¹`, `(p, p)`.
+        noise: s, the standard deviation of the residuals: 1 if the noise that was given for the
+            data is right and the model has no error.
+        degrees: of freedom, of Student's distribution; infinite where the noise is taken as given.
+        mismatches: per coordinate, derivative against secant over the 95 % interval; NaN where the
+            secant could not be computed.
+        widening: factor of each deviation that the secant asks for, at least 1.
+        reasons: why a coordinate is not identifiable; empty where it is.
+    """
+
+    names: tuple[str, ...]
+    u: np.ndarray
+    logarithmic: np.ndarray
+    covariance: np.ndarray
+    noise: float
+    degrees: float
+    mismatches: np.ndarray
+    widening: np.ndarray
+    reasons: tuple[str, ...]
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviations of the coordinates, widened where the secant asks for it, `(p,)`."""
+        return np.sqrt(np.diag(self.covariance)) * self.widening
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Correlations of the coordinates, `(p, p)`."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        return self.covariance / np.outer(deviations, deviations)
+
+    def interval(self, name: str, level: float = 0.95) -> Interval:
+        """The interval of a coordinate (`E`, `v0[2]`) at a level of confidence.
+
+        Raises:
+            ValueError: there is no such coordinate, or the level is not between 0 and 1.
+        """
+        if name not in self.names:
+            raise ValueError(
+                f"Argument `name` must be one of {', '.join(self.names)}, but is {name!r}."
+            )
+        if not 0 < level < 1:
+            raise ValueError(f"Argument `level` must be between 0 and 1, but is {level}.")
+        j = self.names.index(name)
+        half = self.quantile(level) * self.deviations[j]
+        low, high = self.u[j] - half, self.u[j] + half
+        if self.logarithmic[j]:
+            with np.errstate(over="ignore"):
+                low, high = np.exp(low), np.exp(high)
+        verdict, why = "ok", ""
+        if self.reasons[j]:
+            verdict, why = "not identifiable", self.reasons[j]
+        elif self.widening[j] > 1:
+            verdict = "widened"
+            why = f"derivative and secant differ by {self.mismatches[j]:.0%} over the interval"
+        return Interval(float(low), float(high), float(self.mismatches[j]), verdict, why)
+
+    def quantile(self, level: float) -> float:
+        """Half the width of an interval in standard deviations."""
+        return float(stats.t.ppf(0.5 + level / 2, self.degrees))
+
+    def directions(self) -> list[Direction]:
+        """Independent combinations of the coordinates, the best known first."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return [
+            Direction(vectors[:, k], float(np.sqrt(max(values[k], 0)))) for k in range(len(values))
+        ]
+
+
+def uncertainty(problem: Problem, point: Point, *, noise_known: bool = False) -> Uncertainty:
+    """The uncertainty of an estimate; two more simulations per coordinate check the derivative.
+
+    Along the direction in which a coordinate reaches the end of its 95 % interval, the derivative
+    is compared with the secant over that interval. Where they differ by more than 20 % the interval
+    is widened by what the secant asks for.
+
+    Args:
+        problem: what was solved.
+        point: where.
+        noise_known: take the noise of the data as given (s = 1) instead of estimating it from the
+            residual.
+    """
+    # Pixels that no Gaussian ever touches, and data that are missing, say nothing about the noise.
+    counts = (point.residual != 0) | np.any(point.rows != 0, axis=0)
+    p, m = len(point.u), int(np.count_nonzero(counts))
+    degrees = float("inf") if noise_known else float(max(m - p, 1))
+    noise = 1.0 if noise_known else float(np.sqrt(2 * point.cost / degrees))
+    inverse = covariance_of(point.curvature)
+    covariance = noise**2 * inverse
+    quantile = float(stats.t.ppf(0.975, degrees))
+    mismatches, widening, reasons = np.full(p, np.nan), np.ones(p), [""] * p
+    for j in range(p):
+        check = _against_secant(problem, point, inverse, noise * quantile, j)
+        mismatches[j], widening[j], reasons[j] = check
+    logarithmic = problem.space.logarithmic
+    half = quantile * np.sqrt(np.diag(covariance)) * widening
+    for j in range(p):
+        reasons[j] = reasons[j] or _too_wide(problem, point.u, half, j)
+    return Uncertainty(
+        names=tuple(problem.names),
+        u=point.u,
+        logarithmic=logarithmic,
+        covariance=covariance,
+        noise=noise,
+        degrees=degrees,
+        mismatches=mismatches,
+        widening=widening,
+        reasons=tuple(reasons),
+    )
+
+
+def covariance_of(curvature: np.ndarray) -> np.ndarray:
+    """Of a positive semi-definite matrix; what has no curvature gets a huge variance."""
+    root = np.sqrt(np.maximum(np.diag(curvature), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(curvature / np.outer(root, root))
+    values = np.maximum(values, 1e-15 * max(values.max(), 1e-300))
+    return (vectors / values) @ vectors.T / np.outer(root, root)
+
+
+class _Check(NamedTuple):
+    mismatch: float
+    widening: float
+    reason: str
+
+
+def _against_secant(
+    problem: Problem, point: Point, inverse: np.ndarray, width: float, j: int
+) -> _Check:
+    """Derivative and secant between the two ends of the interval of coordinate j."""
+    dtype = np.dtype(jnp.zeros(()).dtype)
+    shortest = _SHORTEST[dtype] * max(1.0, abs(point.u[j]) * (not problem.space.logarithmic[j]))
+    # An interval below what is resolved is checked over what is.
+    length = max(width * np.sqrt(inverse[j, j]), shortest)
+    direction = inverse[:, j] / inverse[j, j] * length
+    lower, upper = problem.space.bounds()
+    if np.abs(direction[problem.space.logarithmic]).max(initial=0) > WIDEST_LOGARITHM:
+        return _Check(np.nan, 1.0, "its 95 % interval spans more than a factor of 100")
+    ends = []
+    for sign in (-1, 1):
+        u = np.clip(point.u + sign * direction, lower, upper)
+        result = outcome(problem, jnp.asarray(u, dtype))
+        if not bool(result.ok):
+            return _Check(np.nan, 1.0, "the simulation fails inside of its interval")
+        ends.append((u, np.asarray(result.residual, np.float64)))
+    (low, r_low), (high, r_high) = ends
+    secant, derivative = r_high - r_low, (high - low) @ point.rows
+    size = float(np.linalg.norm(secant))
+    if size == 0:
+        return _Check(np.inf, 1.0, "the observation does not change over its interval")
+    mismatch = float(np.linalg.norm(secant - derivative)) / size
+    if mismatch <= LARGEST_MISMATCH:
+        return _Check(mismatch, 1.0, "")
+    # How far the secant says one has to go for the change that the derivative promises.
+    along = float(secant @ derivative) / max(float(derivative @ derivative), 1e-300)
+    if along <= 0.1:
+        return _Check(mismatch, 1.0, "derivative and secant disagree over its interval")
+    return _Check(mismatch, max(1.0, 1 / along, np.sqrt(1 + mismatch**2)), "")
+
+
+def _too_wide(problem: Problem, u: np.ndarray, half: np.ndarray, j: int) -> str:
+    """Why an interval says nothing; empty if it says something."""
+    lower, upper = problem.space.bounds()
+    if problem.space.logarithmic[j] and 2 * half[j] > WIDEST_LOGARITHM:
+        return "its 95 % interval spans more than a factor of ten"
+    if np.isfinite(upper[j] - lower[j]) and half[j] > 0.5 * (upper[j] - lower[j]):
+        return "its 95 % interval is as wide as its bounds"
+    if abs(u[j] - lower[j]) < 1e-9 or abs(u[j] - upper[j]) < 1e-9:
+        return f"it ended on its {'lower' if abs(u[j] - lower[j]) < 1e-9 else 'upper'} bound"
+    return ""
