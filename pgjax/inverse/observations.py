@@ -7,7 +7,7 @@ import abc
 import copy
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -190,9 +190,6 @@ class Cloud(AbstractObservation):
         return off / self.sigma.astype(off.dtype)
 
 
-Channel = Literal["rgb", "silhouette", "depth"]
-
-
 @final
 class Pictures(AbstractObservation):
     """Pictures of the Gaussians that move with the particles, from one camera or many.
@@ -215,7 +212,7 @@ class Pictures(AbstractObservation):
     """
 
     frames: tuple[int, ...] = eqx.field(static=True)
-    channel: Channel = eqx.field(static=True)
+    channel: str = eqx.field(static=True)
     rule: Rule
     gaussians: Gaussians
     cameras: Camera
@@ -235,7 +232,7 @@ class Pictures(AbstractObservation):
         cameras: Camera | Sequence[Camera],
         data: Any,
         *,
-        channel: Channel = "rgb",
+        channel: str = "rgb",
         background: Any = (0.0, 0.0, 0.0),
         frames: Sequence[int] | None = None,
         sigma: Any = 0.05,
