@@ -143,6 +143,7 @@ def test_fit_from_pictures(recorded, tmp_path, capsys):
     assert cli.main(["fit", str(case), "--out", str(out)]) == 1
 
 
+@pytest.mark.float64
 def test_fit_from_a_track(recorded, tmp_path):
     case = write(recorded, "track.toml", data='[track]\nfile = "track.npz"\n')
     assert cli.main(["fit", str(case), "--out", str(tmp_path / "out")]) == 0

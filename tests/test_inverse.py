@@ -136,6 +136,7 @@ def test_recovers_an_elastic_body(measure):
     assert "E" in found.summary()
 
 
+@float64
 def test_noise_gives_intervals():
     found = fit(elastic_problem(noise=2e-3), tolerance=1e-4)
     assert found.uncertainty is not None
@@ -180,6 +181,7 @@ def _starting(problem, u):
     return problem.freeing(tuple(problem.space.free), values)
 
 
+@float64
 def test_bound_is_kept_and_told():
     """The truth lies beyond a bound: no iterate does."""
     unknowns = parameters(E=Parameter(8e3, lower=2e3, upper=1.5e4, log=True))
@@ -210,6 +212,7 @@ def _plastic_problem(start):
     return problem.observing(Positions(data))
 
 
+@float64
 def test_no_yielding_is_named():
     with pytest.raises(FitError, match="yield_stress has no influence"):
         fit(_plastic_problem(5e5))
@@ -224,6 +227,7 @@ def test_recovers_a_yield_stress():
     assert all(trial.taken or trial.note for trial in found.trials)
 
 
+@float64
 def test_lost_particles_are_rejected():
     """A first guess that throws the body out of the grid fails by name; a later trial is undone."""
     build, x = block(closed=False)
@@ -247,6 +251,7 @@ def test_lost_particles_are_rejected():
     assert found.point.cost < found.trials[0].cost
 
 
+@float64
 def test_missing_data_do_not_count():
     problem = elastic_problem(frames=3)
     data = np.array(problem.observations[0].data)
@@ -278,6 +283,7 @@ def test_stages_and_starts():
         fit(elastic_problem(unknowns=free), starts=4)
 
 
+@float64
 def test_priors_count_as_data():
     """With a strong prior the estimate stays where it is."""
     told = parameters(E=Parameter(8e3, lower=2e3, upper=5e4, log=True, prior=(1e4, 1e-4)))
@@ -297,6 +303,7 @@ def test_profile_agrees_with_the_interval():
     np.testing.assert_allclose(curve.costs[[1, 4]], curve.threshold, rtol=1e-3)
 
 
+@float64
 def test_more_views_help():
     problem = elastic_problem(frames=3, noise=2e-3)
     found = fit(problem, tolerance=1e-3)
@@ -308,6 +315,7 @@ def test_more_views_help():
     assert (expected["a longer film"] < expected["one more particle"]).all()
 
 
+@float64
 def test_first_order_descent_reaches_it_too():
     unknowns = parameters(nu=Parameter(0.3, fixed=True), v0=Parameter(TRUTH["v0"], fixed=True))
     values, end = descend_problem(elastic_problem(unknowns=unknowns), steps=40, rate=0.1)

@@ -104,6 +104,7 @@ def test_fit_from_pictures(measure):
     measure("ID3", "error of v0 from one camera, m/s", off, below=1e-3)
 
 
+@float64
 def test_fit_from_silhouettes():
     known = parameters(nu=Parameter(0.3, fixed=True), E=Parameter(2e4, fixed=True))
     found = fit(pictured("silhouette", 2, frames=3, unknowns=known), tolerance=1e-4)
@@ -168,6 +169,7 @@ def test_sinkhorn_is_a_transport_plan():
     np.testing.assert_allclose(r, expected, atol=2e-3)
 
 
+@float64
 def test_outliers_do_not_decide():
     problem = elastic_problem(frames=4, unknowns=parameters(nu=Parameter(0.3, fixed=True)))
     data = np.array(problem.observations[0].data)
@@ -179,6 +181,7 @@ def test_outliers_do_not_decide():
     assert errors[0] < 0.05 * errors[1]
 
 
+@float64
 def test_frames_and_weights():
     """A frame of weight 0 says nothing; a missing one is not compared."""
     problem = elastic_problem(frames=3)

@@ -69,8 +69,9 @@ def operands(rule, channels=4, seed=0):
 
 
 @needs_compiler
-@pytest.mark.parametrize("channels", [4, 7])
-@pytest.mark.parametrize("rule", RULES, ids=["3dgs", "smooth"])
+@pytest.mark.parametrize(
+    ("rule", "channels"), zip(RULES, (4, 7), strict=True), ids=["3dgs", "smooth"]
+)
 def test_native_and_plain_agree(monkeypatch, rule, channels):
     """Image, tangent and adjoint; single, batched, and with shared and own operands."""
     scene = [a[None] for a in operands(rule, channels)]

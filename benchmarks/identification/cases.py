@@ -201,7 +201,8 @@ def _tumbling(name, truth, parameters, material_of, targets) -> Case:
         x, volumes = sampling.block(center - edge / 2, center + edge / 2, resolution.h / 2)
         x = center + resolution.jittered(x - center)
         grid = resolution.grid((0, 0, 0), (1, 1, 1))
-        walls = Box((0.06,) * 3, (0.94,) * 3, Separating(0.0))
+        # On nodes of this grid and of the finer one.
+        walls = Box((0.1,) * 3, (0.9,) * 3, Separating(0.0))
 
         def of(values):
             scene = pgjax.Scene(
