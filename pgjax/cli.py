@@ -1,15 +1,18 @@
 """The command line: `pgjax run`, `pgjax fit`, `pgjax view` and `pgjax info`."""
 
 import argparse
+import contextlib
 import os
 import platform
 import shlex
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pgjax.scenes import Plan
@@ -142,9 +145,10 @@ def _simulate(options: argparse.Namespace, planned: "Plan", folder: Path) -> int
     from pgjax.scenes.record import unfinished
 
     try:
-        with tqdm(total=planned.frames, unit="frame", file=sys.stderr) as bar:
+        with _gentle_interrupts() as stop, tqdm(total=planned.frames, unit="frame") as bar:
 
             def show(frame: int, _: int) -> None:
+                stop()
                 if options.resume and not bar.n:
                     # What was there already was not simulated in the time the bar shows.
                     bar.initial = bar.n = max(frame - 1, 0)
@@ -170,6 +174,34 @@ def _simulate(options: argparse.Namespace, planned: "Plan", folder: Path) -> int
         return 130 if was_stopped else 1
     print(f"wrote      {video}")
     return 0
+
+
+@contextlib.contextmanager
+def _gentle_interrupts() -> Iterator[Callable[[], None]]:
+    """A function that raises `KeyboardInterrupt` if Ctrl-C was pressed; again, it acts at once.
+
+    Raised anywhere, it may be lost: exceptions in the callbacks of garbage collection are ignored.
+    """
+    came: list[int] = []
+
+    def stop() -> None:
+        if came:
+            raise KeyboardInterrupt
+
+    def note(number: int, frame: Any) -> None:
+        if came:
+            signal.default_int_handler(number, frame)
+        came.append(number)
+        print("\nstopping after this frame; Ctrl-C again stops at once", file=sys.stderr)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _foretell(options: argparse.Namespace, planned: "Plan", folder: Path) -> None:

@@ -122,6 +122,7 @@ def write(folder, name="case.toml", *, start=1e4, data=VIEW, extra=""):
     return path
 
 
+@pytest.mark.float64
 def test_fit_from_pictures(recorded, tmp_path, capsys):
     """From a folder of pictures to a report, and a scene file that runs."""
     case = write(recorded)
@@ -135,6 +136,7 @@ def test_fit_from_pictures(recorded, tmp_path, capsys):
     sheet = imageio.imread(out / "view-1.png")
     assert sheet.shape == (3 * 50, 6 * 50, 3)
     fitted = tomllib.loads((out / "fitted.toml").read_text())
+    assert fitted["time"]["dt"] == prepare(read_case(case)).problem.dt
     np.testing.assert_allclose(np.log10(fitted["material"][0]["E"] / 2e4), 0, atol=0.03)
     np.testing.assert_allclose(fitted["model"]["velocity"], [0, 0, -1], atol=0.03)
     planned = plan(read_scene(out / "fitted.toml"))
@@ -181,6 +183,8 @@ def test_every_unknown_finds_its_place(recorded):
     [
         (("material.E", "material.G"), "end with one of E, density, nu"),
         (("material.E", "metal.E"), "begin with material"),
+        (("material.E", "material.plasticity.E"), "end with one of"),
+        (("model.velocity", "model.2.velocity"), "count the .*model.* tables from 1 to 1"),
         (("material.E", "material.2.E"), "count the .*material.* tables from 1 to 1"),
         (("start = 10000.0", "start = [1.0, 2.0, 3.0]"), "`start` must"),
         (("fit_frames = 5", "fit_frames = 9"), "`fit_frames` must be a whole number"),

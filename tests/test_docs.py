@@ -57,6 +57,7 @@ def test_rendering(tmp_path):
     np.testing.assert_allclose(lengths, 1, atol=1e-3)
 
 
+@pytest.mark.float64
 def test_identification():
     names = run_blocks(ROOT / "docs" / "identification.md")
     for found in (names["found"], names["staged"]):

@@ -10,7 +10,7 @@ import numpy as np
 from pgjax.render import load_image, load_video
 from pgjax.result import SimulationWarning
 from pgjax.scenes import SceneError
-from pgjax.scenes.reader import Table
+from pgjax.scenes.reader import Table, naming
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,13 @@ def footage(t: Table, frame_rate: float, first: int, last: int) -> Footage:
         found = _from_folder(t, t.existing_path("frames"), first, last)
     if not len(found.numbers):
         raise SceneError(f"{t.name}: there is no picture from number {first} on.")
-    missing = sorted(set(range(last + 1)) - set(found.numbers.tolist()))
+    _tell_missing(t, found.numbers, last)
+    return found
+
+
+def _tell_missing(t: Table, numbers: np.ndarray, last: int) -> None:
+    """Warn of frames that are not there."""
+    missing = sorted(set(range(last + 1)) - set(numbers.tolist()))
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", …" if len(missing) > 8 else "")
         warnings.warn(
@@ -54,19 +60,19 @@ def footage(t: Table, frame_rate: float, first: int, last: int) -> Footage:
             SimulationWarning,
             stacklevel=2,
         )
-    return found
 
 
 def _from_video(t: Table, path: Path, frame_rate: float, first: int, last: int) -> Footage:
-    rate, pictures = load_video(path, first + last + 1)
-    if abs(rate - frame_rate) > 1e-2 * frame_rate:
-        raise t.error(
-            "video",
-            f"have the `frame_rate` of the case, {frame_rate:g} per second, but {path.name} has "
-            f"{rate:g}; `frame_rate`",
+    with naming(t.name):
+        film = load_video(path, first + last + 1)
+    if abs(film.rate - frame_rate) > 1e-2 * frame_rate:
+        raise SceneError(
+            f"{t.name}: `video` must have the `frame_rate` of the case, {frame_rate:g} per second, "
+            f"but {path.name} has {film.rate:g}."
         )
-    kept = pictures[first:].astype(np.float32) / 255
-    return Footage(t.name, np.arange(len(kept)), kept)
+    numbers = film.numbers - first
+    kept = (numbers >= 0) & (numbers <= last)
+    return Footage(t.name, numbers[kept], film.pictures[kept].astype(np.float32) / 255)
 
 
 def _from_folder(t: Table, folder: Path, first: int, last: int) -> Footage:
@@ -113,20 +119,21 @@ class Track:
     particles: np.ndarray
 
 
-def track(t: Table, count: int) -> Track:
+def track(t: Table, count: int, last: int) -> Track:
     """A track from its file.
 
     Args:
         t: the table; its `file` is an .npz with `x` and, where they are not 0, 1, …, `particles`
             and `frames`.
         count: number of particles of the scene.
+        last: number of the last frame that is wanted.
     """
     path = t.existing_path("file")
     try:
         with np.load(path) as data:
             arrays = {name: data[name] for name in data.files}
-    except (ValueError, OSError) as error:
-        raise t.error("file", f"be an .npz file ({error})") from error
+    except Exception as error:  # Whatever is wrong with the file.
+        raise t.error("file", f"be an .npz file ({type(error).__name__}: {error})") from error
     if "x" not in arrays or arrays["x"].ndim != 3 or arrays["x"].shape[2] != 3:
         found = ", ".join(f"{n} {a.shape}" for n, a in arrays.items())
         raise t.error("file", f"hold an array x of shape (frames, particles, 3) (it has {found})")
@@ -140,5 +147,6 @@ def track(t: Table, count: int) -> Track:
             f"has {len(numbers)} and {len(particles)})",
         )
     if np.max(particles) >= count or np.min(particles) < 0:
-        raise t.error("file", f"hold numbers of `particles` below {count}")
+        raise t.error("file", f"hold numbers of `particles` from 0 to {count - 1}")
+    _tell_missing(t, np.append(numbers, 0), min(int(np.max(numbers)), last))
     return Track(np.asarray(numbers, int), x, np.asarray(particles, int))

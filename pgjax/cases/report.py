@@ -85,7 +85,7 @@ def _uncertainty(found: Fit) -> list[str]:
     lines = [
         "## How sure",
         "",
-        f"The residual is {u.noise:.3g} of the noise that was given. Intervals follow from it; "
+        f"The residual is {u.noise:.3g} times the noise that was given. Intervals follow from it; "
         "they do not know of errors of the model.",
         "",
         "| | derivative against secant | " + " | ".join(f"`{n}`" for n in u.names) + " |",
@@ -106,18 +106,20 @@ def _convergence(found: Fit) -> list[str]:
     lines = [
         "## Convergence",
         "",
-        "| s | cost | " + " | ".join(f"`{n}`" for n in names) + " | |",
-        "|---:|---:|" + "---:|" * len(names) + "---|",
+        "| s | frames | cost | " + " | ".join(f"`{n}`" for n in names) + " | |",
+        "|---:|---:|---:|" + "---:|" * len(names) + "---|",
     ]
     logarithmic = found.problem.space.logarithmic
     for trial in found.trials:
-        if len(trial.u) != len(names):
-            cells = " | ".join("" for _ in names)
-        else:
-            values = np.where(logarithmic, np.exp(np.where(logarithmic, trial.u, 0)), trial.u)
-            cells = " | ".join(f"{v:.6g}" for v in values)
+        known = dict(zip(trial.names, trial.u, strict=True))
+        cells = " | ".join(
+            "" if name not in known else f"{np.exp(known[name]) if log else known[name]:.6g}"
+            for name, log in zip(names, logarithmic, strict=True)
+        )
         note = "" if trial.taken else f"rejected: {trial.note}"
-        lines.append(f"| {trial.seconds:.1f} | {trial.cost:.6g} | {cells} | {note} |")
+        lines.append(
+            f"| {trial.seconds:.1f} | {trial.frames} | {trial.cost:.6g} | {cells} | {note} |"
+        )
     return [*lines, ""]
 
 

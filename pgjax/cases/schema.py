@@ -4,11 +4,14 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pgjax.cases.unknowns import Unknown, unknown
 from pgjax.inverse import Stage
 from pgjax.scenes import SceneFile, read_scene, resolve
 from pgjax.scenes.camera import CameraPart, camera
 from pgjax.scenes.reader import Table, content, nearest, parse
+from pgjax.scenes.schema import scene_from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,12 +152,18 @@ def _stage(t: Table, keys: list[str], fit_frames: int) -> Stage:
     return Stage(frames, free)
 
 
-def fitted_content(case: CaseFile, values: dict[str, Any]) -> dict[str, Any]:
-    """The scene file with the estimates in it, for any folder."""
+def fitted_content(case: CaseFile, values: dict[str, Any], dt: float) -> dict[str, Any]:
+    """The scene file with values of the unknowns in it, for any folder, and the fit's time step.
+
+    Raises:
+        SceneError: a key of the case is not one of the scene file.
+    """
     made = content(case.scene_path)
     for u in case.unknowns:
         _replace(made, u.key.split("."), values[u.key])
+    made.setdefault("time", {})["dt"] = dt
     _relocate(made, case.scene_path.parent)
+    scene_from(Table(f"{case.path.name}: the scene with its unknowns", made), case.name)
     return made
 
 
@@ -162,12 +171,15 @@ def _replace(tree: Any, names: list[str], value: Any) -> None:
     """Write a value where a key of the case says; a table of one needs no number."""
     *path, last = names
     for name in path:
-        if isinstance(tree, list) and not name.isdigit():
+        if name.isdigit():
+            tree = tree[int(name) - 1] if isinstance(tree, list) else tree
+            continue
+        if isinstance(tree, list):
             (tree,) = tree
-        tree = tree[int(name) - 1] if isinstance(tree, list) else tree.setdefault(name, {})
+        tree = tree.setdefault(name, {})
     if isinstance(tree, list):
         (tree,) = tree
-    tree[last] = value.tolist() if hasattr(value, "tolist") else value
+    tree[last] = np.asarray(value).tolist()
 
 
 def _relocate(tree: Any, old: Path) -> None:

@@ -20,8 +20,12 @@ from pgjax.inverse.observations import AbstractObservation
 from pgjax.render import Camera
 from pgjax.result import SimulationWarning
 from pgjax.scenes import Plan, SceneError, plan
+from pgjax.scenes.camera import CameraPart
+from pgjax.scenes.regions import Triple
+from pgjax.timestep import substeps_for
 
-# The first pictures are that of the scene at rest up to this (root mean square of a pixel).
+# The first pictures are those of the scene at rest up to this: root mean square over the pixels in
+# which either shows something.
 _ALIKE = 0.15
 
 
@@ -47,7 +51,7 @@ class Prepared:
 
 
 def prepare(case: CaseFile) -> Prepared:
-    """Load scene and data and see that they fit together; nothing is compiled yet.
+    """Load scene and data and see that they fit together, before anything is fitted.
 
     Raises:
         SceneError: they do not.
@@ -62,7 +66,13 @@ def prepare(case: CaseFile) -> Prepared:
                 footage(t, case.frame_rate, case.first, case.frames) for t, _ in case.views
             )
             observations = [
-                _of_view(case, made, film, _camera(case, made, part, t.name))
+                _of_view(
+                    case,
+                    made,
+                    film,
+                    _camera(case, made, part or made.view, t.name),
+                    (part or made.view).background,
+                )
                 for film, (t, part) in zip(films, case.views, strict=True)
             ]
     for t, _ in case.views:
@@ -76,24 +86,31 @@ def prepare(case: CaseFile) -> Prepared:
         observations,
         frame_dt=1 / case.frame_rate,
         frames=case.frames,
+        substeps=_given_steps(case),
+        fraction=case.scene.time.fraction,
     )
-    notes = [str(w.message) for w in caught] + _first_look(whole, films)
+    # The keys stand in the scene file as they are written.
+    fitted_content(case, {u.key: u.parameter.start for u in case.unknowns}, whole.dt)
+    notes = [str(w.message) for w in caught] + _first_look(case, whole, films)
     return Prepared(case, made, whole.until(case.fit_frames), whole, films, tuple(notes))
 
 
-def _camera(case: CaseFile, made: Plan, part, label: str) -> Camera:
+def _camera(case: CaseFile, made: Plan, part: CameraPart, label: str) -> Camera:
     """The camera of a view, which has to stand still."""
-    view = made.view.view if part is None else part.view
-    first, last = (
-        view.at(frame / case.frame_rate, made.to_simulation) for frame in (0, case.frames)
+    first, *rest = (
+        part.view.at(frame / case.frame_rate, made.to_simulation)
+        for frame in range(case.frames + 1)
     )
-    pairs = zip(jax.tree.leaves(first), jax.tree.leaves(last), strict=True)
-    if not all(np.array_equal(a, b) for a, b in pairs):
-        raise SceneError(f"{label}: the camera must stand still, but moves between the frames.")
+    for other in rest:
+        pairs = zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True)
+        if not all(np.array_equal(a, b) for a, b in pairs):
+            raise SceneError(f"{label}: the camera must stand still, but moves between frames.")
     return first
 
 
-def _of_view(case: CaseFile, made: Plan, film: Footage, camera: Camera) -> AbstractObservation:
+def _of_view(
+    case: CaseFile, made: Plan, film: Footage, camera: Camera, background: Triple
+) -> AbstractObservation:
     height, width = film.pictures.shape[1:3]
     if (height, width) != (camera.height, camera.width):
         raise SceneError(
@@ -106,8 +123,8 @@ def _of_view(case: CaseFile, made: Plan, film: Footage, camera: Camera) -> Abstr
         made.moving,
         camera,
         data,
-        channel="rgb" if case.channel == "rgb" else "silhouette",
-        background=made.view.background,
+        channel=case.channel,
+        background=background,
         frames=film.numbers.tolist(),
         sigma=case.noise,
         still=made.still if len(made.still) else None,
@@ -116,8 +133,10 @@ def _of_view(case: CaseFile, made: Plan, film: Footage, camera: Camera) -> Abstr
 
 def _of_track(case: CaseFile, made: Plan) -> list[AbstractObservation]:
     assert case.track is not None
-    found = track(case.track, made.scene.particle_count)
+    found = track(case.track, made.scene.particle_count, case.frames)
     kept = found.numbers <= case.frames
+    if not kept.any():
+        raise case.track.error("file", f"hold frames up to {case.frames}, the last one")
     return [
         Positions(
             found.x[kept],
@@ -128,7 +147,13 @@ def _of_track(case: CaseFile, made: Plan) -> list[AbstractObservation]:
     ]
 
 
-def _first_look(problem: Problem, films: tuple[Footage, ...]) -> list[str]:
+def _given_steps(case: CaseFile) -> int | None:
+    """Steps per frame of the scene's own time step, if it has one."""
+    dt = case.scene.time.dt
+    return None if dt is None else substeps_for(1 / case.frame_rate, dt)
+
+
+def _first_look(case: CaseFile, problem: Problem, films: tuple[Footage, ...]) -> list[str]:
     """Whether the first picture of each view looks like the scene at rest."""
     notes = []
     _, state = problem.build(problem.space.values(problem.space.start))
@@ -137,7 +162,13 @@ def _first_look(problem: Problem, films: tuple[Footage, ...]) -> list[str]:
             continue
         assert isinstance(observation, Pictures)
         seen, data = np.asarray(observation.see(state)), np.asarray(observation.data[0])
-        off = float(np.sqrt(np.mean((seen - data) ** 2)))
+        rgb = case.channel == "rgb"
+        behind = np.asarray(observation.background) if rgb else 0.0
+        drawn = (np.abs(seen - behind) > _ALIKE / 2) | (np.abs(data - behind) > _ALIKE / 2)
+        drawn = drawn.any(axis=-1) if rgb else drawn
+        if not drawn.any():
+            continue
+        off = float(np.sqrt(np.mean((seen - data)[drawn] ** 2)))
         if off > _ALIKE:
             notes.append(
                 f"{film.label}: the first picture does not look like the scene at rest (root mean "
@@ -165,18 +196,18 @@ def solve(
         report=report,
     )
     out.mkdir(parents=True, exist_ok=True)
-    content = fitted_content(case, {n: found.values[n] for n in found.problem.space.free})
+    content = fitted_content(case, found.values, found.problem.dt)
     with replacing(out / "fitted.toml") as temporary:
         temporary.write_bytes(tomli_w.dumps(content).encode())
-    comparisons = _compared(prepared, found)
-    return found, write_report(out, case, found, comparisons, prepared.notes)
+    comparisons, told = _compared(prepared, found)
+    return found, write_report(out, case, found, comparisons, (*prepared.notes, *told))
 
 
-def _compared(prepared: Prepared, found: Fit) -> list[Comparison]:
-    """What every observation shows of all frames, beside what is predicted."""
+def _compared(prepared: Prepared, found: Fit) -> tuple[list[Comparison], list[str]]:
+    """What every observation shows of all frames, beside what is predicted; and what happened."""
     whole = prepared.whole
     u = jnp.asarray(whole.space.vector({n: found.values[n] for n in whole.space.free}))
-    saved, _ = whole.see(u.astype(jnp.zeros(()).dtype))
+    saved, status = whole.see(u.astype(jnp.zeros(()).dtype))
     made = []
     for seen, o in zip(saved, whole.observations, strict=True):
         frames = np.asarray(o.frames)
@@ -185,4 +216,4 @@ def _compared(prepared: Prepared, found: Fit) -> list[Comparison]:
                 frames, np.asarray(o.data), np.asarray(seen)[frames], isinstance(o, Pictures)
             )
         )
-    return made
+    return made, status.messages() if whole.frames > found.problem.frames else []

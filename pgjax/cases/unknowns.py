@@ -79,13 +79,13 @@ def place(unknown: Unknown, plan: Plan) -> Place:
     group, *rest = unknown.key.split(".")
     finders = {"material": _of_material, "boundary": _of_boundary, "model": _of_model}
     if group == "forces" and rest:
-        found = _of_scene(rest[-1], unknown, plan)
+        found = _of_scene(".".join(rest), unknown, plan)
     elif group in finders and rest:
         number = int(rest[0]) - 1 if rest[0].isdigit() else None
         names = rest[1:] if rest[0].isdigit() else rest
         if not names:
             raise _wrong(unknown, "name a key of the table, as in `material.E`")
-        found = finders[group](number, names[-1], unknown, plan)
+        found = finders[group](number, names, unknown, plan)
     else:
         groups = (*finders, "forces")
         raise _wrong(unknown, f"begin with {', '.join(groups)} and a dot{nearest(group, groups)}")
@@ -111,15 +111,25 @@ def _chosen(items: Any, number: int | None, kind: str, unknown: Unknown) -> int:
     return number
 
 
-def _of_material(number: int | None, name: str, unknown: Unknown, plan: Plan) -> Place:
+def _of_material(number: int | None, names: list[str], unknown: Unknown, plan: Plan) -> Place:
     index = _chosen(plan.scene.materials, number, "material", unknown)
     material = plan.scene.materials[index]
-    paths = [path for path, _ in parameter_paths(material)]
-    field = _OTHER_NAMES.get(name, name)
-    fitting = [path for path in paths if path[-1] == field and _at(material, path) is not None]
+    inner = {"plasticity": "plasticity", "active": "active"}.get(names[0])
+    if inner is not None:
+        parts: tuple[str, ...] = (inner,)
+    else:
+        # What flows by itself (snow) has its keys in the table of the material.
+        own = material.elasticity.elastic().companion() is not None
+        parts = ("elasticity", "density", "plasticity") if own else ("elasticity", "density")
+    if len(names) != (1 if inner is None else 2):
+        raise _wrong(unknown, "be `material.KEY`, `material.plasticity.KEY`, `material.active.KEY`")
+    paths = [path for path, _ in parameter_paths(material) if path[0] in parts]
+    paths = [path for path in paths if _at(material, path) is not None]
+    field = _OTHER_NAMES.get(names[-1], names[-1])
+    fitting = [path for path in paths if path[-1] == field]
     if not fitting:
-        known = sorted({path[-1] for path in paths if _at(material, path) is not None})
-        raise _wrong(unknown, f"end with one of {', '.join(known)}{nearest(name, known)}")
+        known = sorted({path[-1] for path in paths})
+        raise _wrong(unknown, f"end with one of {', '.join(known)}{nearest(names[-1], known)}")
     # That of the outermost law: damping is wrapped around what is damped.
     path = min(fitting, key=len)
     value = _at(material, path)
@@ -136,11 +146,11 @@ def _at(tree: Any, path: tuple[str, ...]) -> Any:
     return tree
 
 
-def _of_boundary(number: int | None, name: str, unknown: Unknown, plan: Plan) -> Place:
+def _of_boundary(number: int | None, names: list[str], unknown: Unknown, plan: Plan) -> Place:
     index = _chosen(plan.scene.boundaries, number, "boundary", unknown)
     wall = plan.scene.boundaries[index]
     friction = getattr(getattr(wall, "contact", None), "friction", None)
-    if name != "friction" or friction is None:
+    if names != ["friction"] or friction is None:
         raise _wrong(unknown, 'be `boundary.N.friction` of a wall with contact = "separating"')
 
     def put(scene: Scene, state: State, new: Array) -> tuple[Scene, State]:
@@ -161,12 +171,12 @@ def _of_scene(name: str, unknown: Unknown, plan: Plan) -> Place:
     return Place(getattr(plan.scene, name), put)
 
 
-def _of_model(number: int | None, name: str, unknown: Unknown, plan: Plan) -> Place:
+def _of_model(number: int | None, names: list[str], unknown: Unknown, plan: Plan) -> Place:
     index = _chosen(plan.models, number, "model", unknown)
     model, mine = plan.models[index], plan.body == index
     x = np.asarray(plan.moving.means, np.float64)
     center = np.average(x[mine], axis=0, weights=np.asarray(plan.scene.volumes)[mine])
-    if name == "velocity":
+    if names == ["velocity"]:
         now = np.asarray(model.velocity)
 
         def push(scene: Scene, state: State, new: Array) -> tuple[Scene, State]:
@@ -174,7 +184,7 @@ def _of_model(number: int | None, name: str, unknown: Unknown, plan: Plan) -> Pl
             return scene, eqx.tree_at(lambda s: s.v, state, state.v + change)
 
         return Place(jnp.asarray(now), push)
-    if name != "angular_velocity":
+    if names != ["angular_velocity"]:
         raise _wrong(unknown, "end with velocity or angular_velocity")
     now = np.asarray(model.angular_velocity)
     off = np.where(mine[:, None], x - center, 0)

@@ -53,7 +53,7 @@ def gradient_check(
     Args:
         problem: whose derivatives.
         values: where, in physical units; at the first guess if None.
-        steps: of the differences, in free coordinates: relative for a logarithmic parameter.
+        steps: of the differences, in free coordinates; relative where those are larger than 1.
 
     Raises:
         FitError: the simulation fails at that point.
@@ -66,6 +66,7 @@ def gradient_check(
         raise FitError(f"The simulation at these values fails: {point.failure}")
     _, reverse = cost_and_slope(problem, jnp.asarray(u, dtype))
     scale = np.abs(point.rows) @ np.abs(point.residual)
+    scale = scale + np.abs(point.prior_rows) @ np.abs(point.prior)
     modes = np.max(np.abs(np.asarray(reverse) - point.slope) / np.maximum(scale, 1e-300))
     errors = np.zeros((space.size, len(steps)))
     for j in range(space.size):
@@ -73,9 +74,9 @@ def gradient_check(
             ends = []
             for sign in (1, -1):
                 at = u.copy()
-                at[j] += sign * step
+                at[j] += sign * step * max(1.0, abs(u[j]))
                 ends.append(np.asarray(outcome(problem, jnp.asarray(at, dtype)).residual, float))
-            difference = (ends[0] - ends[1]) / (2 * step)
+            difference = (ends[0] - ends[1]) / (2 * step * max(1.0, abs(u[j])))
             size = max(np.linalg.norm(difference), np.linalg.norm(point.rows[j]), 1e-300)
             errors[j, k] = np.linalg.norm(difference - point.rows[j]) / size
     return GradientCheck(tuple(problem.names), float(modes), np.asarray(steps), errors)

@@ -50,6 +50,7 @@ def descend(
     start: Any,
     *,
     steps: int,
+    where: Callable[[Any], Any] | None = None,
     optimizer: optax.GradientTransformation | None = None,
     rate: float | optax.Schedule = 1e-2,
     report: Callable[[int, Step], None] | None = None,
@@ -64,6 +65,7 @@ def descend(
             mode through checkpointed steps (`pgjax.simulate` with `throw=False`).
         start: where to begin; what is not a floating array in it stays.
         steps: how many gradients are computed.
+        where: the part of the tree that is free, e.g. `lambda law: law.network`; all if None.
         optimizer: of optax; Adam with `rate` if None.
         rate: of Adam: a number or a schedule of optax.
         report: called after each step with its number.
@@ -74,7 +76,12 @@ def descend(
     if steps < 1:
         raise ValueError(f"Argument `steps` must be at least 1, but is {steps}.")
     optimizer = optax.adam(rate) if optimizer is None else optimizer
-    free, rest = eqx.partition(start, eqx.is_inexact_array)
+    chosen: Any = eqx.is_inexact_array
+    if where is not None:
+        nothing = jax.tree.map(lambda _: False, start)
+        part = jax.tree.map(eqx.is_inexact_array, where(start))
+        chosen = eqx.tree_at(where, nothing, part)
+    free, rest = eqx.partition(start, chosen)
 
     @eqx.filter_jit
     def slope_of(free: Any) -> tuple[Array, Any, Array]:

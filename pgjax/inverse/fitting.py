@@ -16,7 +16,7 @@ from pgjax.inverse.levenberg import (
     Trial,
     levenberg_marquardt,
 )
-from pgjax.inverse.problem import Problem, outcomes
+from pgjax.inverse.problem import Problem, costs
 from pgjax.inverse.uncertainty import Uncertainty, uncertainty
 
 # Starts that are simulated at once, and how many of them are followed to their end.
@@ -71,7 +71,7 @@ class Fit:
 
     @property
     def iterations(self) -> int:
-        """Points that were tried after the first of each descent."""
+        """Points that were tried, those of stages and other starts included."""
         return len(self.trials)
 
     def summary(self) -> str:
@@ -106,7 +106,7 @@ def fit(
     stages: Sequence[Stage] = (),
     starts: int = 1,
     trials: int = 30,
-    tolerance: float = 1e-6,
+    tolerance: float | None = None,
     intervals: bool = True,
     noise_known: bool = False,
     seed: int = 0,
@@ -121,7 +121,8 @@ def fit(
             (a power of two is best) are simulated at once, and the best three of them and the first
             guess are followed. Every free parameter then needs both bounds.
         trials: how many points each descent tries at most.
-        tolerance: of the free coordinates, at which a descent ends; 1e-6 of a logarithm.
+        tolerance: of the free coordinates, at which a descent ends; 1e-6 in double precision and
+            1e-4 in single by default.
         intervals: compute the uncertainty, two more simulations per coordinate.
         noise_known: take the noise given for the data as it is instead of estimating it.
         seed: of the starts.
@@ -132,6 +133,8 @@ def fit(
         ValueError: an argument is out of range.
     """
     began = time.perf_counter()
+    if tolerance is None:
+        tolerance = 1e-6 if jnp.zeros(()).dtype == jnp.float64 else 1e-4
     if starts < 1 or trials < 1 or not tolerance > 0:
         raise ValueError(
             "Arguments `starts` and `trials` must be at least 1 and `tolerance` positive, but are "
@@ -156,6 +159,9 @@ def fit(
     if intervals:
         found = uncertainty(problem, best.best, noise_known=noise_known)
         run.simulations += 2 * problem.space.size
+    messages = _messages(problem, best, others, failures)
+    if found is not None and np.isinf(found.degrees) and not noise_known:
+        messages.append("There are no more data than unknowns: the noise given for them is taken.")
     return Fit(
         problem=problem,
         values=problem.space.known(best.best.u),
@@ -166,7 +172,7 @@ def fit(
         converged=best.converged,
         reason=best.reason,
         uncertainty=found,
-        messages=_messages(problem, best, others, failures),
+        messages=messages,
         simulations=run.simulations,
         seconds=time.perf_counter() - began,
     )
@@ -201,13 +207,12 @@ class _Run:
         spread = qmc.Sobol(space.size, rng=seed).random_base2(int(np.ceil(np.log2(starts))))
         points = lower + spread[:starts] * (upper - lower)
         points = np.concatenate([space.start[None], points])
-        result = outcomes(
-            self.problem, jnp.asarray(points, jnp.zeros(()).dtype), min(_AT_ONCE, len(points))
-        )
+        us = jnp.asarray(points, jnp.zeros(()).dtype)
+        found, ok = costs(self.problem, us, min(_AT_ONCE, len(points)))
         self.simulations += len(points)
-        costs = np.where(np.asarray(result.ok), np.asarray(result.cost), np.inf)
-        order = [0, *(1 + np.argsort(costs[1:])[:_FOLLOWED])]
-        return [points[k] for k in order if np.isfinite(costs[k])] or [space.start]
+        usable = np.where(np.asarray(ok), np.asarray(found), np.inf)
+        order = [0, *(1 + np.argsort(usable[1:])[:_FOLLOWED])]
+        return [points[k] for k in order if np.isfinite(usable[k])] or [space.start]
 
     def follow(self, guess: np.ndarray, stages: Sequence[Stage]) -> Descent:
         """Through the stages, then the whole problem."""
@@ -255,9 +260,12 @@ def _messages(
     if not best.converged:
         messages.append(f"The fit did not converge: {best.reason}.")
     lower, upper = problem.space.bounds()
-    for name, u, low, high in zip(problem.names, best.best.u, lower, upper, strict=True):
-        for bound, side in ((low, "lower"), (high, "upper")):
-            if abs(u - bound) <= 1e-9 * max(1.0, abs(bound)):
+    slopes, curvatures = best.best.slope, np.diag(best.best.curvature)
+    rows = zip(problem.names, best.best.u, lower, upper, slopes, curvatures, strict=True)
+    for name, u, low, high, slope, curvature in rows:
+        for bound, side, sign in ((low, "lower", -1), (high, "upper", 1)):
+            pushes = -sign * slope > 1e-3 * np.sqrt(2 * best.best.cost * curvature)
+            if abs(u - bound) <= 1e-9 * max(1.0, abs(bound)) and pushes:
                 messages.append(
                     f"{name} ended on its {side} bound: the data ask for a value beyond it."
                 )

@@ -9,7 +9,7 @@ from scipy import stats
 from pgjax.inverse.fitting import Fit, fit
 from pgjax.inverse.levenberg import FitError, evaluate
 from pgjax.inverse.problem import Problem
-from pgjax.inverse.uncertainty import covariance_of
+from pgjax.inverse.uncertainty import covariance_of, noise_of
 
 
 class Profile(NamedTuple):
@@ -46,7 +46,8 @@ def profile(
 ) -> Profile:
     """Profile likelihood of a parameter of one number: the others are fitted at each value.
 
-    An interval from `JᵀJ` is right where the model is linear over it; this one always is.
+    An interval from `JᵀJ` is right where the model is linear over it; this one needs no such thing.
+    Costs are those of the fit's own noise: a prior counts against the data as it does in `fit`.
 
     Args:
         found: the fit.
@@ -79,16 +80,15 @@ def profile(
                 costs.append(np.inf if point.failure else point.cost)
         except FitError:
             costs.append(np.inf)
-    m = np.count_nonzero(found.point.residual)
-    s2 = 1.0 if noise_known else 2 * found.point.cost / max(m - problem.space.size, 1)
-    rise = s2 * stats.chi2.ppf(level, 1) / 2
+    noise, degrees = noise_of(problem, found.point, known=noise_known)
+    rise = noise**2 * stats.t.ppf(0.5 + level / 2, degrees) ** 2 / 2
     return Profile(
         name, np.asarray(values, float), np.asarray(costs), found.point.cost + float(rise), level
     )
 
 
 def information(problem: Problem, values: Mapping[str, Any]) -> np.ndarray:
-    """Fisher information `JᵀJ` of the free coordinates at these values, `(p, p)`.
+    """Fisher information `JᵀJ` of the data alone about the free coordinates, `(p, p)`.
 
     Raises:
         FitError: the simulation fails there.
@@ -96,7 +96,7 @@ def information(problem: Problem, values: Mapping[str, Any]) -> np.ndarray:
     point = evaluate(problem, problem.space.vector({n: values[n] for n in problem.space.free}))
     if point.failure is not None:
         raise FitError(f"The simulation at these values fails: {point.failure}")
-    return point.curvature
+    return point.rows @ point.rows.T
 
 
 def would_help(found: Fit, candidates: Mapping[str, Problem]) -> dict[str, np.ndarray]:
@@ -105,7 +105,8 @@ def would_help(found: Fit, candidates: Mapping[str, Problem]) -> dict[str, np.nd
     Args:
         found: the fit.
         candidates: problems of the same parameters, observed from another camera or in another
-            motion. Their data are not looked at: zeros of the right shape will do.
+            motion. Of their data only which are there counts (NaN and, for depth, 0 are not), and
+            robust losses and matching: give none of these.
 
     Returns:
         Per candidate the deviations of the free coordinates (relative, of a logarithm), `(p,)`;

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from pgjax.inverse.problem import Problem, linearised
 from pgjax.result import ERRORS, Status
@@ -16,9 +17,11 @@ class Point(NamedTuple):
 
     Attributes:
         u: free coordinates, `(p,)`.
-        cost: half the squared sum of the residual.
-        residual: `(m,)`.
+        cost: half the squared sum of residual and prior.
+        residual: of the data, `(m,)`.
         rows: `∂r/∂u_j`, `(p, m)`.
+        prior: residual of the priors, `(k,)`.
+        prior_rows: its derivative, `(p, k)`.
         failure: why the point cannot be used; None if it can.
         status: of the simulation.
     """
@@ -27,24 +30,28 @@ class Point(NamedTuple):
     cost: float
     residual: np.ndarray
     rows: np.ndarray
+    prior: np.ndarray
+    prior_rows: np.ndarray
     failure: str | None
     status: Status
 
     @property
     def slope(self) -> np.ndarray:
         """Gradient of the cost, `(p,)`."""
-        return self.rows @ self.residual
+        return self.rows @ self.residual + self.prior_rows @ self.prior
 
     @property
     def curvature(self) -> np.ndarray:
-        """`JᵀJ`, `(p, p)`."""
-        return self.rows @ self.rows.T
+        """`JᵀJ` of data and priors, `(p, p)`."""
+        return self.rows @ self.rows.T + self.prior_rows @ self.prior_rows.T
 
 
 class Trial(NamedTuple):
     """One line of the history.
 
     Attributes:
+        names: of the coordinates that were free.
+        frames: number of frames that counted.
         u: where.
         cost: half the squared sum of the residual there; infinite where it failed.
         taken: whether it became the current point.
@@ -52,6 +59,8 @@ class Trial(NamedTuple):
         seconds: since the start.
     """
 
+    names: tuple[str, ...]
+    frames: int
     u: np.ndarray
     cost: float
     taken: bool
@@ -84,7 +93,8 @@ def evaluate(problem: Problem, u: np.ndarray) -> Point:
     result, rows = linearised(problem, jnp.asarray(u, jnp.zeros(()).dtype))
     residual = np.asarray(result.residual, np.float64)
     rows = np.asarray(rows, np.float64)
-    cost = float(residual @ residual) / 2
+    prior = np.asarray(result.prior, np.float64)
+    cost = float(residual @ residual + prior @ prior) / 2
     failure = None
     if not bool(result.status.ok):
         failure = " ".join(result.status.messages(ERRORS))
@@ -92,14 +102,16 @@ def evaluate(problem: Problem, u: np.ndarray) -> Point:
         failure = "the residual is not finite"
     elif not np.isfinite(rows).all():
         failure = "the derivative is not finite"
-    return Point(np.array(u), cost, residual, rows, failure, result.status)
+    prior_rows = problem.space.prior_rows()
+    return Point(np.array(u), cost, residual, rows, prior, prior_rows, failure, result.status)
 
 
 def without_influence(problem: Problem, point: Point) -> list[str]:
     """Names of the coordinates on which the residual does not depend, but for rounding."""
-    sizes = np.linalg.norm(point.rows, axis=1)
+    # Of a change by one, or by itself where it is larger: units do not count.
+    sizes = np.linalg.norm(point.rows, axis=1) * np.maximum(1, np.abs(point.u))
     rounding = 100 * float(jnp.finfo(jnp.zeros(()).dtype).eps)
-    silent = sizes <= rounding * sizes.max()
+    silent = (sizes <= rounding * sizes.max()) & ~np.any(point.prior_rows != 0, axis=1)
     return [name for name, is_silent in zip(problem.names, silent, strict=True) if is_silent]
 
 
@@ -139,19 +151,21 @@ def levenberg_marquardt(
 
     def remember(point: Point, taken: bool, note: str = "") -> None:
         cost = np.inf if point.failure else point.cost
-        history.append(Trial(point.u, cost, taken, note, time.perf_counter() - began))
+        seconds = time.perf_counter() - began
+        names = tuple(problem.names)
+        history.append(Trial(names, problem.frames, point.u, cost, taken, note, seconds))
         if report is not None:
             report(history[-1])
 
     current = evaluate(problem, start)
     silent = without_influence(problem, current)
     if current.failure is not None:
-        raise FitError(f"The simulation of the first guess fails: {current.failure}")
+        raise FitError(f"The simulation at {_told(problem, start)} fails: {current.failure}")
     if silent:
         raise FitError(
-            f"The first guess cannot be improved: {', '.join(silent)} has no influence on what is "
-            "observed (nothing yields, touches, or moves there). Choose another start, or observe "
-            "more frames."
+            f"{', '.join(silent)} has no influence on what is observed of {problem.frames} frames "
+            f"at {_told(problem, start)} (nothing yields, touches, or moves there). Choose another "
+            "start, or observe more frames."
         )
     remember(current, True)
     lower, upper = problem.space.bounds()
@@ -174,13 +188,14 @@ def levenberg_marquardt(
         note = trial.failure or ""
         if lost:
             note = f"{', '.join(lost)} would lose all influence"
-        gained = current.cost - trial.cost if not note else -np.inf
-        ratio = gained / _promised(current, step)
-        taken = bool(ratio > 1e-4)
+        gained = 0.0 if note else current.cost - trial.cost
+        promised = _promised(current, step)
+        ratio = gained / promised if promised > 0 else 0.0
+        taken = not note and bool(ratio > 1e-4)
         remember(trial, taken, note or ("" if taken else "the cost would not fall"))
         if taken:
             current = trial
-            damping *= max(1 / 3, 1 - (2 * float(ratio) - 1) ** 3)
+            damping *= max(1 / 3, 1 - (2 * ratio - 1) ** 3)
             growth = 4.0
         else:
             damping *= growth
@@ -201,36 +216,29 @@ def _promised(point: Point, step: np.ndarray) -> float:
 def _bounded_step(
     point: Point, damping: float, scale: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> np.ndarray:
-    """The damped Gauss–Newton step of the coordinates that are not pushed against their bound."""
-    held = np.zeros(len(point.u), bool)
-    step = np.zeros_like(point.u)
-    for _ in range(len(held) + 1):
-        free = ~held
-        step = np.zeros_like(point.u)
-        if not free.any():
-            return step
-        matrix = point.curvature + damping * np.diag(scale)
-        step[free] = _solve(matrix[np.ix_(free, free)], -point.slope[free])
-        beyond = free & ((point.u + step < lower) | (point.u + step > upper))
-        if not beyond.any():
-            return step
-        towards = np.where(point.u + step < lower, lower, upper)
-        at_bound = np.abs(towards - point.u) <= 1e-12 * np.maximum(1, np.abs(towards))
-        blocked = beyond & at_bound
-        if not blocked.any():
-            return np.clip(point.u + step, lower, upper) - point.u
-        held |= blocked
-    return step
-
-
-def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Of a positive semi-definite system, scaled to a unit diagonal first."""
+    """The damped Gauss–Newton step: the minimum of the damped model within the bounds."""
+    matrix = point.curvature + damping * np.diag(scale)
     root = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    scaled = matrix / np.outer(root, root)
-    return np.linalg.lstsq(scaled, right / root, rcond=1e-14)[0] / root
+    values, vectors = np.linalg.eigh(matrix / np.outer(root, root))
+    kept = values > 1e-14 * values.max()
+    sizes, vectors = np.sqrt(values[kept]), vectors[:, kept]
+    low, high = np.minimum(lower - point.u, 0) * root, np.maximum(upper - point.u, 0) * root
+    target = -(vectors.T @ (point.slope / root)) / sizes
+    found = lsq_linear(sizes[:, None] * vectors.T, target, (low, high), method="bvls")
+    return np.clip(point.u + found.x / root, lower, upper) - point.u
 
 
 def _shortened(step: np.ndarray, logarithmic: np.ndarray, longest: float) -> np.ndarray:
     """The step, or as much of it as changes no logarithm by more than `longest`."""
     largest = np.max(np.abs(step[logarithmic]), initial=0.0)
     return step if largest <= longest else step * (longest / largest)
+
+
+def _told(problem: Problem, u: np.ndarray) -> str:
+    """Values of the free parameters in words, as far as there are few."""
+    values = problem.space.known(u)
+    return ", ".join(
+        f"{name} = {np.array2string(values[name], precision=5)}"
+        for name, parameter in problem.space.free.items()
+        if parameter.start.size <= 6
+    )

@@ -17,8 +17,7 @@ class Chamfer(eqx.Module):
     """Each point and the nearest one of the other cloud, both ways.
 
     Exact derivatives where the nearest point does not change. The residual of a pair is the vector
-    between its points; those of a cloud of n count `1/√n` each, so that half the squared sum is
-    half the symmetric Chamfer distance.
+    between its points, over √2: a pair that is nearest both ways is there twice, and counts once.
     """
 
     def __call__(
@@ -27,8 +26,7 @@ class Chamfer(eqx.Module):
         """Residual vectors of the points x, then of the data."""
         to_data = x - data[_nearest(x, data)]
         to_points = x[_nearest(data, x)] - data
-        n, m = x.shape[0], data.shape[0]
-        return jnp.concatenate([to_data / n**0.5, to_points / m**0.5])
+        return jnp.concatenate([to_data, to_points]) / 2**0.5
 
 
 @final
@@ -56,7 +54,7 @@ class Sinkhorn(eqx.Module):
             raise ValueError(f"Argument `iterations` must be at least 1, but is {self.iterations}.")
 
     def __call__(self, x: Float[Array, "n d"], data: Float[Array, "m d"]) -> Float[Array, "m d"]:
-        """Residual vectors of the data, `1/√m` each."""
+        """Residual vectors of the data."""
         n, m = x.shape[0], data.shape[0]
         if n * m > 4 * _PAIRS:
             raise ValueError(
@@ -74,7 +72,7 @@ class Sinkhorn(eqx.Module):
         # The last half sweep makes the marginal of the data exact; given g, f only normalises.
         f = -jax.nn.logsumexp(score + g[None] - jnp.log(float(m)), axis=1)
         weights = jax.nn.softmax(score + f[:, None], axis=0)
-        return (weights.T @ x - data) / m**0.5
+        return weights.T @ x - data
 
 
 def _nearest(points: Float[Array, "n d"], others: Float[Array, "m d"]) -> Array:

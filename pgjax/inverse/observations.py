@@ -200,8 +200,8 @@ class Pictures(AbstractObservation):
         data: `(frames, cameras, height, width)` for silhouettes (opacity, 0 to 1) and depth (m),
             with a last axis of 3 for rgb (0 to 1); the axis of cameras is left out with one
             `Camera`. NaN marks pixels that do not count.
-        channel: "rgb", "silhouette" or "depth". Depth counts where data and picture both see
-            something.
+        channel: "rgb", "silhouette" or "depth" (0 where nothing is seen). A pixel of depth where
+            data and picture do not agree that there is something counts as three deviations.
         background: of rgb: red, green, blue, or an image.
         frames, weights, robust: as for `Positions`.
         sigma: standard deviation of a pixel's noise, in its unit.
@@ -282,9 +282,12 @@ class Pictures(AbstractObservation):
     def compare(self, seen: Any) -> Array:
         """`(picture − data)/sigma`; 0 where a pixel does not count."""
         data = self.data.astype(seen.dtype)
-        if self.channel == "depth":
-            data = jnp.where((seen > 0) & (data > 0), data, jnp.nan)
-        return _differences(seen, data, self.sigma)
+        off = _differences(seen, data, self.sigma)
+        if self.channel != "depth":
+            return off
+        # A difference in metres to nothing says nothing; leaving the silhouette must not pay.
+        missed = jnp.where(jnp.isfinite(data) & ((seen > 0) != (data > 0)), 3, 0)
+        return jnp.where((seen > 0) & (data > 0), off, missed.astype(off.dtype))
 
     def _check_data(self) -> None:
         size = (self.cameras.height, self.cameras.width)

@@ -241,18 +241,32 @@ class Space(eqx.Module):
         return values
 
     def prior_residual(self, u: Float[Array, " size"]) -> Float[Array, " k"]:
-        """`(u − mean)/deviation` of every coordinate that has a prior."""
+        """`(u − mean)/deviation` of every entry that has a prior; constant of fixed parameters."""
         parts, place = [], 0
-        for parameter in self.free.values():
-            size = parameter.start.size
+        for parameter in self.members:
+            at = jnp.asarray(parameter.start, u.dtype).ravel()
+            at = jnp.log(at) if parameter.log else at
+            if not parameter.fixed:
+                at = u[place : place + parameter.start.size]
+                place += parameter.start.size
             if parameter.prior is not None:
-                mean, deviation = parameter.prior
-                mean = jnp.ravel(jnp.asarray(mean, u.dtype))
-                mean = jnp.log(mean) if parameter.log else mean
-                off = u[place : place + size] - mean
-                parts.append(off / jnp.ravel(jnp.asarray(deviation, u.dtype)))
-            place += size
+                mean, deviation = (jnp.asarray(a, u.dtype).ravel() for a in parameter.prior)
+                parts.append((at - (jnp.log(mean) if parameter.log else mean)) / deviation)
         return jnp.concatenate(parts) if parts else jnp.zeros((0,), u.dtype)
+
+    def prior_rows(self) -> np.ndarray:
+        """Its derivative, which is constant, `(size, k)`."""
+        size = self.size
+        columns, place = [], 0
+        for parameter in self.members:
+            count = parameter.start.size
+            if parameter.prior is not None:
+                block = np.zeros((size, count))
+                if not parameter.fixed:
+                    block[place : place + count] = np.diag(1 / parameter.prior[1].ravel())
+                columns.append(block)
+            place += 0 if parameter.fixed else count
+        return np.concatenate(columns, axis=1) if columns else np.zeros((size, 0))
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:

@@ -27,17 +27,19 @@ class Outcome(NamedTuple):
     """One simulation against the data.
 
     Attributes:
-        residual: differences over their noise, then those of the priors, `(m,)`.
+        residual: differences over their noise, `(m,)`.
+        prior: the same of the priors, `(k,)`.
         status: what happened in the simulation.
     """
 
     residual: Float[Array, "*batch m"]
+    prior: Float[Array, "*batch k"]
     status: Status
 
     @property
     def cost(self) -> Float[Array, "*batch"]:
-        """Half the squared sum of the residual."""
-        return jnp.sum(self.residual**2, axis=-1) / 2
+        """Half the squared sum of residual and prior."""
+        return (jnp.sum(self.residual**2, axis=-1) + jnp.sum(self.prior**2, axis=-1)) / 2
 
     @property
     def ok(self) -> Bool[Array, "*batch"]:
@@ -100,6 +102,8 @@ class Problem(eqx.Module):
             raise ValueError(
                 f"Argument `frames` must reach the last observed frame, {last}, but is {frames}."
             )
+        scene, _ = build(self.space.values(self.space.start))
+        _check_particles(self.observations, scene)
         self.substeps = _steps(self.space, build, self.frame_dt, substeps, fraction)
 
     @property
@@ -147,6 +151,7 @@ class Problem(eqx.Module):
         single = isinstance(observations, AbstractObservation)
         kept = (observations,) if single else tuple(observations)
         frames = max(self.frames, *(o.frames[-1] for o in kept))
+        _check_particles(kept, self.build(self.space.values(self.space.start))[0])
         return self._with(self.space, kept, frames)
 
     def _with(
@@ -184,9 +189,9 @@ class Problem(eqx.Module):
         """Simulate at free coordinates u and compare. Pure; differentiable in u."""
         saved, status = self.see(u)
         parts = [o.residual(seen) for o, seen in zip(self.observations, saved, strict=True)]
-        parts = [*parts, self.space.prior_residual(u)]
         dtype = jnp.result_type(*parts)
-        return Outcome(jnp.concatenate([part.astype(dtype) for part in parts]), status)
+        residual = jnp.concatenate([part.astype(dtype) for part in parts])
+        return Outcome(residual, self.space.prior_residual(u).astype(dtype), status)
 
 
 @final
@@ -204,19 +209,24 @@ def outcome(problem: Problem, u: Float[Array, " size"]) -> Outcome:
 
 
 @eqx.filter_jit
-def outcomes(problem: Problem, us: Float[Array, "n size"], at_once: int) -> Outcome:
-    """Of several points; the residuals are not kept, their half squared sums stand for them."""
+def costs(
+    problem: Problem, us: Float[Array, "n size"], at_once: int
+) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """Costs of several points, and which of the simulations can be used."""
 
-    def one(u: Array) -> Outcome:
+    def one(u: Array) -> tuple[Array, Array]:
         result = problem.outcome(u)
-        return Outcome(jnp.sqrt(2 * result.cost)[None], result.status)
+        return result.cost, result.ok
 
     return jax.lax.map(one, us, batch_size=at_once)
 
 
 @eqx.filter_jit
 def linearised(problem: Problem, u: Float[Array, " size"]) -> tuple[Outcome, Float[Array, "p m"]]:
-    """Outcome and the rows `∂r/∂u_j`, in forward mode: one run and one tangent per coordinate."""
+    """Outcome and the rows `∂r/∂u_j`, in forward mode, one tangent per coordinate.
+
+    Up to eight tangents are computed beside one run.
+    """
     size = u.shape[0]
 
     def push(direction: Array) -> tuple[Outcome, Array]:
@@ -248,6 +258,17 @@ def cost_and_slope(
 
     slope, result = jax.grad(cost, has_aux=True)(u)
     return result, slope
+
+
+def _check_particles(observations: Sequence[AbstractObservation], scene: Scene) -> None:
+    """What is observed is there; an index that is too large would be clamped in silence."""
+    for o in observations:
+        chosen = getattr(o, "particles", None)
+        if chosen is not None and np.max(chosen) >= scene.particle_count:
+            raise ValueError(
+                f"Argument `particles` must hold numbers below {scene.particle_count}, the number "
+                f"of particles, but holds {np.max(chosen)}."
+            )
 
 
 class _Limit(NamedTuple):
@@ -285,26 +306,51 @@ def _steps(
 
 
 def _stiffest(space: Space, limit: Callable[[np.ndarray], _Limit]) -> np.ndarray:
-    """The corner of the bounds with the smallest time step, found coordinate by coordinate.
+    """The corner of the bounds with the smallest time step, found parameter by parameter.
 
-    Exact where the limit is monotone in each coordinate, as it is in moduli and densities.
+    Exact where the limit is monotone in each parameter, as it is in moduli and densities. All
+    entries of a parameter move together.
     """
     u = space.start.copy()
     lower, upper = space.bounds()
-    best = limit(u)
-    for j, name in enumerate(space.names):
-        for bound, sign, side in ((lower[j], -1, "lower"), (upper[j], 1, "upper")):
+    best, place = limit(u), 0
+    for name, parameter in space.free.items():
+        own = slice(place, place + parameter.start.size)
+        place = own.stop
+        for bound, sign, side in ((lower[own], -1, "lower"), (upper[own], 1, "upper")):
             trial = u.copy()
-            if np.isfinite(bound):
-                trial[j] = bound
+            known = np.isfinite(bound)
+            trial[own][known] = bound[known]
+            if known.any():
                 at_bound = limit(trial)
-                if at_bound.used < best.used:
+                # Of equal ones the farther: together with the next it may be the smallest.
+                if at_bound.used <= best.used:
                     u, best = trial, at_bound
-                continue
-            trial[j] += sign * 1e-2 * max(1.0, abs(trial[j]) * (not space.logarithmic[j]))
-            if limit(trial).rest < best.rest * (1 - 1e-4):
-                raise ValueError(
-                    f"Argument `{side}` of parameter {name!r} must be given: the stable time step "
-                    "depends on it, and is decided once for the stiffest scene."
-                )
+            if not known.all():
+                _require_no_limit(name, side, parameter, limit, u, own, sign, best)
     return u
+
+
+def _require_no_limit(
+    name: str,
+    side: str,
+    parameter: Parameter,
+    limit: Callable[[np.ndarray], _Limit],
+    u: np.ndarray,
+    own: slice,
+    sign: int,
+    best: _Limit,
+) -> None:
+    """Raise if the time step at rest falls on the side where nothing bounds a parameter."""
+    for far in (1e-2, 1.0, 4.0):
+        trial = u.copy()
+        trial[own] += sign * far * (1.0 if parameter.log else np.maximum(1, np.abs(trial[own])))
+        reason = "the stable time step depends on it, and is decided once for the stiffest scene"
+        try:
+            falls = limit(trial).rest < best.rest * (1 - 1e-4)
+        except ValueError as error:
+            falls, reason = True, str(error)
+        if falls:
+            raise ValueError(
+                f"Argument `{side}` of parameter {name!r} must be given: {reason.rstrip('.')}."
+            )

@@ -17,6 +17,8 @@ from pgjax.inverse.problem import Problem, outcome
 LARGEST_MISMATCH = 0.2
 # A logarithm whose 95 % interval is wider than a factor of ten says nothing useful.
 WIDEST_LOGARITHM = np.log(10.0)
+# Data without any noise must not divide by zero.
+_LEAST_NOISE = 1e-100
 # Secants over less than this are rounding (single, double precision).
 _SHORTEST = {np.dtype(np.float32): 1e-3, np.dtype(np.float64): 1e-6}
 
@@ -60,13 +62,14 @@ class Uncertainty:
         names: of the coordinates.
         u: the estimate.
         logarithmic: which coordinates are logarithms.
-        covariance: `s² (JᵀJ)⁻¹`, `(p, p)`.
+        covariance: `(JᵀJ/s² + P)⁻¹` with the information P of the priors, `(p, p)`.
         noise: s, the standard deviation of the residuals: 1 if the noise that was given for the
             data is right and the model has no error.
         degrees: of freedom, of Student's distribution; infinite where the noise is taken as given.
         mismatches: per coordinate, derivative against secant over the 95 % interval; NaN where the
             secant could not be computed.
-        widening: factor of each deviation that the secant asks for, at least 1.
+        widening: factor of each deviation that the secant asks for, at least 1; infinite where
+            the interval is refused.
         reasons: why a coordinate is not identifiable; empty where it is.
     """
 
@@ -106,6 +109,8 @@ class Uncertainty:
         j = self.names.index(name)
         half = self.quantile(level) * self.deviations[j]
         low, high = self.u[j] - half, self.u[j] + half
+        if self.reasons[j] and not np.isfinite(self.widening[j]):
+            low, high = -np.inf, np.inf
         if self.logarithmic[j]:
             with np.errstate(over="ignore"):
                 low, high = np.exp(low), np.exp(high)
@@ -142,17 +147,15 @@ def uncertainty(problem: Problem, point: Point, *, noise_known: bool = False) ->
         noise_known: take the noise of the data as given (s = 1) instead of estimating it from the
             residual.
     """
-    # Pixels that no Gaussian ever touches, and data that are missing, say nothing about the noise.
-    counts = (point.residual != 0) | np.any(point.rows != 0, axis=0)
-    p, m = len(point.u), int(np.count_nonzero(counts))
-    degrees = float("inf") if noise_known else float(max(m - p, 1))
-    noise = 1.0 if noise_known else float(np.sqrt(2 * point.cost / degrees))
-    inverse = covariance_of(point.curvature)
-    covariance = noise**2 * inverse
+    noise, degrees = noise_of(problem, point, known=noise_known)
+    p = len(point.u)
+    # What was known before is not scaled by what the data say of their noise.
+    information = point.rows @ point.rows.T / noise**2 + point.prior_rows @ point.prior_rows.T
+    covariance = covariance_of(information)
     quantile = float(stats.t.ppf(0.975, degrees))
     mismatches, widening, reasons = np.full(p, np.nan), np.ones(p), [""] * p
     for j in range(p):
-        check = _against_secant(problem, point, inverse, noise * quantile, j)
+        check = _against_secant(problem, point, covariance, noise, quantile, j)
         mismatches[j], widening[j], reasons[j] = check
     logarithmic = problem.space.logarithmic
     half = quantile * np.sqrt(np.diag(covariance)) * widening
@@ -171,8 +174,26 @@ def uncertainty(problem: Problem, point: Point, *, noise_known: bool = False) ->
     )
 
 
+def noise_of(problem: Problem, point: Point, *, known: bool) -> tuple[float, float]:
+    """Standard deviation of the residual at an estimate, and its degrees of freedom.
+
+    Data that no parameter changes (background, what is missing) say nothing about it. With a robust
+    loss it is the median absolute deviation, which outliers do not move. Where there are no more
+    data than parameters, the noise that was given is taken as it is.
+    """
+    counts = np.any(point.rows != 0, axis=0)
+    degrees = int(np.count_nonzero(counts)) - len(point.u)
+    if known or degrees < 1:
+        return 1.0, float("inf")
+    residual = point.residual[counts]
+    if any(o.robust is not None for o in problem.observations):
+        spread = float(np.median(np.abs(residual)) / stats.norm.ppf(0.75))
+        return max(spread, _LEAST_NOISE), float(degrees)
+    return max(float(np.sqrt(residual @ residual / degrees)), _LEAST_NOISE), float(degrees)
+
+
 def covariance_of(curvature: np.ndarray) -> np.ndarray:
-    """Of a positive semi-definite matrix; what has no curvature gets a huge variance."""
+    """The inverse of a positive semi-definite matrix; without curvature the variance is huge."""
     root = np.sqrt(np.maximum(np.diag(curvature), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(curvature / np.outer(root, root))
     values = np.maximum(values, 1e-15 * max(values.max(), 1e-300))
@@ -186,36 +207,47 @@ class _Check(NamedTuple):
 
 
 def _against_secant(
-    problem: Problem, point: Point, inverse: np.ndarray, width: float, j: int
+    problem: Problem,
+    point: Point,
+    covariance: np.ndarray,
+    noise: float,
+    quantile: float,
+    j: int,
 ) -> _Check:
     """Derivative and secant between the two ends of the interval of coordinate j."""
     dtype = np.dtype(jnp.zeros(()).dtype)
     shortest = _SHORTEST[dtype] * max(1.0, abs(point.u[j]) * (not problem.space.logarithmic[j]))
     # An interval below what is resolved is checked over what is.
-    length = max(width * np.sqrt(inverse[j, j]), shortest)
-    direction = inverse[:, j] / inverse[j, j] * length
+    length = max(quantile * np.sqrt(covariance[j, j]), shortest)
+    if problem.space.logarithmic[j] and length > WIDEST_LOGARITHM:
+        return _Check(np.nan, np.inf, "its 95 % interval spans more than a factor of 100")
+    direction = covariance[:, j] / covariance[j, j] * length
+    # Not so far that another logarithm, which the data may leave open, leaves the model.
+    largest = np.max(np.abs(direction[problem.space.logarithmic]), initial=0)
+    direction = direction * min(1.0, WIDEST_LOGARITHM / max(largest, 1e-300))
     lower, upper = problem.space.bounds()
-    if np.abs(direction[problem.space.logarithmic]).max(initial=0) > WIDEST_LOGARITHM:
-        return _Check(np.nan, 1.0, "its 95 % interval spans more than a factor of 100")
     ends = []
     for sign in (-1, 1):
         u = np.clip(point.u + sign * direction, lower, upper)
         result = outcome(problem, jnp.asarray(u, dtype))
         if not bool(result.ok):
-            return _Check(np.nan, 1.0, "the simulation fails inside of its interval")
+            return _Check(np.nan, np.inf, "the simulation fails inside of its interval")
         ends.append((u, np.asarray(result.residual, np.float64)))
     (low, r_low), (high, r_high) = ends
-    secant, derivative = r_high - r_low, (high - low) @ point.rows
+    # Priors are linear, and count as they do in the covariance.
+    prior = (high - low) @ point.prior_rows
+    secant = np.append((r_high - r_low) / noise, prior)
+    derivative = np.append((high - low) @ point.rows / noise, prior)
     size = float(np.linalg.norm(secant))
     if size == 0:
-        return _Check(np.inf, 1.0, "the observation does not change over its interval")
+        return _Check(np.inf, np.inf, "the observation does not change over its interval")
     mismatch = float(np.linalg.norm(secant - derivative)) / size
     if mismatch <= LARGEST_MISMATCH:
         return _Check(mismatch, 1.0, "")
     # How far the secant says one has to go for the change that the derivative promises.
     along = float(secant @ derivative) / max(float(derivative @ derivative), 1e-300)
     if along <= 0.1:
-        return _Check(mismatch, 1.0, "derivative and secant disagree over its interval")
+        return _Check(mismatch, np.inf, "derivative and secant disagree over its interval")
     return _Check(mismatch, max(1.0, 1 / along, np.sqrt(1 + mismatch**2)), "")
 
 

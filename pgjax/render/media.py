@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any, cast, final
+from typing import IO, Any, NamedTuple, cast, final
 
 import imageio.v3 as imageio
 import imageio_ffmpeg
@@ -51,41 +51,71 @@ def load_image(path: str | os.PathLike[str]) -> np.ndarray:
 
     What was read and is written again has the same pixels.
     """
-    return np.asarray(imageio.imread(Path(path)), np.float64) / 255
+    pixels = np.asarray(imageio.imread(Path(path)))
+    largest = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+    return pixels.astype(np.float64) / largest
 
 
-def load_video(path: str | os.PathLike[str], most: int | None = None) -> tuple[float, np.ndarray]:
-    """Frames per second of a video, and its first `most` frames, `(n, height, width, 3)` uint8.
+class Film(NamedTuple):
+    """A video that was read.
+
+    Attributes:
+        rate: frames per second.
+        numbers: of the frames by their times, from 0: one that was dropped is missing, `(n,)`.
+        pictures: `(n, height, width, 3)`, uint8.
+    """
+
+    rate: float
+    numbers: np.ndarray
+    pictures: np.ndarray
+
+
+def load_video(path: str | os.PathLike[str], most: int | None = None) -> Film:
+    """Read a video, its first `most` frames or all.
 
     Raises:
-        ValueError: the file is not a video.
+        ValueError: the file is not a video, or cannot be decoded.
     """
     file = Path(path)
     if not file.is_file():
         raise ValueError(f"Argument `path` must name a file, but there is no {file}.")
+    limit = [] if most is None else ["-frames:v", str(most)]
     # Its header has size and rate in numbers, `YUV4MPEG2 W640 H480 F25:1 …`.
-    header = _decoded(file, ["-frames:v", "1", "-f", "yuv4mpegpipe"]).partition(b"\n")[0]
-    facts = {word[:1]: word[1:] for word in header.decode("ascii", "replace").split()[1:]}
-    if not {"W", "H", "F"} <= set(facts):
-        raise ValueError(f"The file {file} is not a video that ffmpeg can read.")
+    header = _decoded(file, ["-frames:v", "1", "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe"])
+    words = header.partition(b"\n")[0].decode("ascii", "replace").split()
+    facts = {word[:1]: word[1:] for word in words[1:]}
     width, height = int(facts["W"]), int(facts["H"])
     number, _, by = facts["F"].partition(":")
-    limit = [] if most is None else ["-frames:v", str(most)]
-    raw = _decoded(file, [*limit, "-f", "rawvideo", "-pix_fmt", "rgb24"])
-    frames = np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
-    return int(number) / int(by), frames
+    rate = int(number) / int(by)
+    # As they are stored: ffmpeg would fill a gap with copies.
+    each = ["-fps_mode", "passthrough"]
+    raw = _decoded(file, [*limit, *each, "-f", "rawvideo", "-pix_fmt", "rgb24"])
+    pictures = np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+    seconds = _times(_decoded(file, [*limit, *each, "-f", "framecrc"]).decode("ascii", "replace"))
+    return Film(rate, np.round((seconds - seconds[0]) * rate).astype(int), pictures)
+
+
+def _times(listing: str) -> np.ndarray:
+    """Times of the frames in a listing of ffmpeg's `framecrc`, s."""
+    lines = listing.splitlines()
+    base = next(line.split()[-1] for line in lines if line.startswith("#tb 0:"))
+    numerator, _, denominator = base.partition("/")
+    stamps = [int(line.split(",")[2]) for line in lines if line and not line.startswith("#")]
+    return np.asarray(stamps) * int(numerator) / int(denominator)
 
 
 def _decoded(file: Path, options: list[str]) -> bytes:
-    """What ffmpeg makes of a video; nothing where it can make nothing of it."""
+    """What ffmpeg makes of a video."""
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(file)]
     done = subprocess.run(
-        [*command, *options, "-"],
+        [*command, "-map", "0:v:0", *options, "-"],
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        capture_output=True,
         check=False,
     )
+    if done.returncode or not done.stdout:
+        reason = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise ValueError(f"The file {file} is not a video that ffmpeg can read: {''.join(reason)}.")
     return done.stdout
 
 

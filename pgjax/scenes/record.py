@@ -17,8 +17,8 @@ from pgjax.scenes.build import Plan
 from pgjax.storage import digest, durably_replacing
 
 _VERSION = 1
-# Parts of a plan that decide no frame: how many there are, and what is said about the scene.
-_IRRELEVANT = ("frames", "notes")
+# Parts of a plan that decide no frame: how many there are, and where the particles came from.
+_IRRELEVANT = ("frames", "notes", "models", "body")
 # What a killed run leaves of a file that it was writing.
 _HALF_WRITTEN = re.compile(r"\..+-[0-9a-f]{12}\.\w+")
 _END_OF_PNG = b"IEND\xaeB`\x82"
