@@ -194,10 +194,13 @@ def _gentle_interrupts() -> Iterator[Callable[[], None]]:
         came.append(number)
         print("\nstopping after this frame; Ctrl-C again stops at once", file=sys.stderr)
 
-    if threading.current_thread() is not threading.main_thread():
+    in_main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT)
+    # Who started it in the background may have had it ignored.
+    if not in_main or before is signal.SIG_IGN:
         yield stop
         return
-    before = signal.signal(signal.SIGINT, note)
+    signal.signal(signal.SIGINT, note)
     try:
         yield stop
     finally:

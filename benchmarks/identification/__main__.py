@@ -32,15 +32,20 @@ def main() -> int:
     options = parser.parse_args()
     target = options.out / "identification_cpu.json"
     known = json.loads(target.read_text())["rows"] if target.exists() else []
-    rows = {(row["case"], row["tier"]): row for row in known}
+    rows = {(row["case"], row["tier"], row["views"]): row for row in known}
     for name in options.cases:
         for tier in options.tiers:
-            row = _run(name, tier, options.views, cases[name].double)
-            rows[name, tier] = row
+            views = options.views if cases[name].views else 0
+            row = _run(name, tier, views, cases[name].double)
+            rows[name, tier, views] = row
             print(report.line(row), flush=True)
-            ordered = [rows[n, t] for n in cases for t in ("self", "cross") if (n, t) in rows]
-            report.write(options.out, ordered)
+            report.write(options.out, sorted(rows.values(), key=lambda row: _place(cases, row)))
     return 0
+
+
+def _place(cases: dict, row: dict) -> tuple[int, bool, int]:
+    """Where a row stands in the table."""
+    return list(cases).index(row["case"]), row["tier"] == "cross", row["views"]
 
 
 def _run(name: str, tier: str, views: int, double: bool) -> dict:
@@ -48,7 +53,8 @@ def _run(name: str, tier: str, views: int, double: bool) -> dict:
     env = {**os.environ, "JAX_ENABLE_X64": str(int(double)), "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(command, env=env, stdout=subprocess.PIPE, text=True)
     if done.returncode:
-        return {"case": name, "tier": tier, "error": f"exit status {done.returncode}"}
+        failed = f"exit status {done.returncode}"
+        return {"case": name, "tier": tier, "views": views, "error": failed}
     return json.loads(done.stdout.splitlines()[-1])
 
 

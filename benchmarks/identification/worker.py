@@ -13,7 +13,7 @@ from pgjax.inverse import FitError, fit
 def run(name: str, tier: str, views: int) -> dict:
     """One row of the table."""
     case = all_cases()[name]
-    made = problem(case, tier, views)
+    made = problem(case, tier, views or None)
     row = {
         "case": name,
         "tier": tier,

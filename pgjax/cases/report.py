@@ -54,16 +54,17 @@ def write_report(
 
 def _estimates(found: Fit) -> list[str]:
     lines = [
-        "| parameter | estimate | 95 % interval | unit | verdict |",
-        "|---|---:|---|---|---|",
+        "| parameter | estimate | 90 % interval | 95 % interval | unit | verdict |",
+        "|---|---:|---|---|---|---|",
     ]
     for name, value, unit in found.rows():
-        span, verdict = "", ""
+        narrow, wide, verdict = "", "", ""
         if found.uncertainty is not None:
-            interval = found.uncertainty.interval(name)
-            span = f"{interval.low:.5g} … {interval.high:.5g}"
+            inner, interval = (found.uncertainty.interval(name, level) for level in (0.9, 0.95))
+            narrow = f"{inner.low:.5g} … {inner.high:.5g}"
+            wide = f"{interval.low:.5g} … {interval.high:.5g}"
             verdict = interval.verdict + (f": {interval.why}" if interval.why else "")
-        lines.append(f"| `{name}` | {value:.6g} | {span} | {unit} | {verdict} |")
+        lines.append(f"| `{name}` | {value:.6g} | {narrow} | {wide} | {unit} | {verdict} |")
     return [
         *lines,
         "",
