@@ -26,7 +26,9 @@ install_import_hook("pgjax", "typecheck.check")
 
 
 def pytest_configure(config):
-    config.addinivalue_line("markers", "float64: needs double precision")
+    config.addinivalue_line(
+        "markers", "float64: needs double precision, or one pass of two is enough"
+    )
 
 
 def pytest_collection_modifyitems(items):

@@ -26,6 +26,7 @@ def run_benchmark(name, *options):
     return run
 
 
+@pytest.mark.float64
 def test_quick_speed_table_is_whole():
     run = run_benchmark(*SPEED)
     table = rows(run.stdout)
@@ -54,6 +55,7 @@ def numbers_of(table):
     }
 
 
+@pytest.mark.float64
 def test_quick_render_tables_are_whole():
     times, memory = (
         run_benchmark("render", "--quick", "--without-peers").stdout.strip().split("\n\n")

@@ -30,12 +30,14 @@ def test_readme():
     assert float(names["height"]) > 0.1
 
 
+@pytest.mark.float64
 def test_extend():
     names = run_blocks(ROOT / "docs" / "extend.md")
     assert all(jnp.isfinite(slope) for slope in names["slopes"])
     assert all(slope != 0 for slope in names["slopes"])
 
 
+@pytest.mark.float64
 def test_rendering(tmp_path):
     names = run_blocks(ROOT / "docs" / "rendering.md", folder=tmp_path)
     np.testing.assert_allclose(names["image"].rgb, names["same"].rgb, atol=1e-5)

@@ -19,6 +19,7 @@ HERE = Path(__file__).parent
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler")
 
 
+@pytest.mark.float64
 @needs_compiler
 @pytest.mark.parametrize("name", ["check", "check_exchange"])
 def test_kernels_outside_of_jax(tmp_path, name):
