@@ -26,9 +26,7 @@ install_import_hook("pgjax", "typecheck.check")
 
 
 def pytest_configure(config):
-    config.addinivalue_line(
-        "markers", "float64: needs double precision, or one pass of two is enough"
-    )
+    config.addinivalue_line("markers", "float64: needs double precision, or one of two passes")
 
 
 def pytest_collection_modifyitems(items):
