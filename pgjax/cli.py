@@ -47,6 +47,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"pgjax {metadata.version('pgjax')}")
     commands = parser.add_subparsers(required=True, metavar="command")
 
+    _add_run(commands)
+    _add_view(commands)
+    _add_fit(commands)
+    info = commands.add_parser("info", help="print versions, devices and what will be used")
+    info.set_defaults(command=_info)
+    return parser
+
+
+def _add_run(commands: Any) -> None:
     run = commands.add_parser("run", help="simulate a scene and write a video of it")
     run.add_argument("scene", help="name of a preset, or a scene file (.toml)")
     run.add_argument("--ply", type=Path, help="a captured scene in place of the scene's own model")
@@ -70,6 +79,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.set_defaults(command=_run)
 
+
+def _add_view(commands: Any) -> None:
     view = commands.add_parser(
         "view", help='look at a scene in the browser while it is simulated (extra "view")'
     )
@@ -95,6 +106,8 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument("--no-open", action="store_true", help="open no browser")
     view.set_defaults(command=_view)
 
+
+def _add_fit(commands: Any) -> None:
     fit = commands.add_parser("fit", help="find parameters of a scene from what was recorded of it")
     fit.add_argument("case", type=Path, help="a case file (.toml)")
     fit.add_argument(
@@ -107,10 +120,6 @@ def _parser() -> argparse.ArgumentParser:
         "--dry-run", action="store_true", help="check everything, say what it costs, write nothing"
     )
     fit.set_defaults(command=_fit)
-
-    info = commands.add_parser("info", help="print versions, devices and what will be used")
-    info.set_defaults(command=_info)
-    return parser
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -128,7 +128,7 @@ class Positions(AbstractObservation):
 
     def see(self, state: State) -> Array:
         """Positions of the observed particles."""
-        return state.x if self.particles is None else state.x[self.particles]
+        return _places(state, self.particles)
 
     def compare(self, seen: Any) -> Array:
         """`(x − data)/sigma`; 0 where nothing was seen."""
@@ -181,7 +181,7 @@ class Cloud(AbstractObservation):
 
     def see(self, state: State) -> Array:
         """Positions of the particles."""
-        return state.x if self.particles is None else state.x[self.particles]
+        return _places(state, self.particles)
 
     def compare(self, seen: Any) -> Array:
         """Differences of matched points over sigma."""
@@ -300,6 +300,11 @@ class Pictures(AbstractObservation):
                 f"{self.channel} from {number} of {size[1]} × {size[0]} pixels, but has shape "
                 f"{self.data.shape}."
             )
+
+
+def _places(state: State, particles: Array | None) -> Array:
+    """Positions of these particles, or of all."""
+    return state.x if particles is None else state.x[particles]
 
 
 def observed_frames(frames: Sequence[int] | None, count: int) -> tuple[int, ...]:
