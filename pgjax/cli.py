@@ -279,13 +279,15 @@ def _fit(options: argparse.Namespace) -> int:
     case = read_case(options.case, options.data)
     folder = options.out or _next_folder(case.name)
     prepared = prepare(case)
-    problem = prepared.problem
+    problem, particles = prepared.problem, prepared.plan.scene.particle_count
     for note in prepared.notes:
         print(f"warning: {note}", file=sys.stderr)
     print(
         f"fit        {', '.join(problem.names)} to {problem.frames} frames, "
-        f"{prepared.plan.scene.particle_count} particles, {problem.substeps} steps a frame"
+        f"{particles} particles, {problem.substeps} steps a frame"
     )
+    moved = particles * problem.substeps * problem.frames * (1 + problem.space.size)
+    print(f"each point {moved:.2g} particle-steps, those of tangents included")
     if options.dry_run:
         return 0
     found, report = solve(prepared, folder, report=lambda line: print(line, flush=True))

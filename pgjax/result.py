@@ -95,6 +95,11 @@ class Status(eqx.Module):
             count = count.at[condition].set(jnp.where(total > NEVER - n, NEVER, total + n))
         return Status(first, count)
 
+    def merged(self, other: "Status") -> "Status":
+        """What happened in one of two rollouts."""
+        total = jnp.where(self.count > NEVER - other.count, NEVER, self.count + other.count)
+        return Status(jnp.minimum(self.first, other.first), total)
+
     def happened(self, condition: Condition) -> Bool[Array, "*batch"]:
         """Whether the condition ever held."""
         return self.count[..., condition] > 0

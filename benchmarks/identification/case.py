@@ -55,7 +55,8 @@ class Case:
         watched: centre and distance of the ring of cameras.
         stages: of the fit.
         substeps: per frame, if the case prescribes them.
-        trials: of the fit at most.
+        trials: of each descent of the fit at most.
+        limit: demanded number of iterations, those of the stages included; None if there is none.
         double: whether double precision is needed.
         about: where the case comes from.
     """
@@ -75,6 +76,7 @@ class Case:
     stages: tuple[Stage, ...] = ()
     substeps: int | None = None
     trials: int = 25
+    limit: int | None = None
     double: bool = False
     about: str = ""
 

@@ -22,24 +22,28 @@ GRAVITY = (0.0, 0.0, -9.8)
 SPEED = Target("absolute", 1e-3, 3e-3)
 
 
+def _on_floor(volumes, materials, resolution: Resolution, **settings) -> pgjax.Scene:
+    """A scene with a sticky floor at z = 0."""
+    return pgjax.Scene(
+        resolution.grid((-0.5, -0.5, -0.02), (0.5, 0.5, 0.7)),
+        materials,
+        volumes,
+        gravity=GRAVITY,
+        boundaries=[Collider(HalfSpace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), Sticky())],
+        spline=pgjax.BSpline(resolution.spline),
+        scheme=pgjax.MLS(),
+        **settings,
+    )
+
+
 def _thrown(material_of, size=(0.3, 0.22, 0.26), center=(0.0, 0.0, 0.32)):
     """A tilted block thrown at a sticky floor: the build of a picture case."""
 
     def build(resolution: Resolution):
         x, volumes = tilted_block(size, center, resolution)
-        grid = resolution.grid((-0.5, -0.5, -0.02), (0.5, 0.5, 0.7))
-        floor = Collider(HalfSpace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), Sticky())
 
         def of(values):
-            scene = pgjax.Scene(
-                grid,
-                material_of(values),
-                volumes,
-                gravity=GRAVITY,
-                boundaries=[floor],
-                spline=pgjax.BSpline(resolution.spline),
-                scheme=pgjax.MLS(),
-            )
+            scene = _on_floor(volumes, material_of(values), resolution)
             return scene, pgjax.initial_state(scene, x, values["v0"])
 
         return x, of
@@ -74,7 +78,7 @@ def _elastic(E: float, name: str) -> Case:
         name,
         {"E": E, "nu": 0.3},
         {
-            "E": Parameter(1.5e5, lower=5e4, upper=2e6, log=True, unit="Pa"),
+            "E": Parameter(1.5e5, lower=5e4, upper=2 * E, log=True, unit="Pa"),
             "nu": Parameter(0.2, lower=0.0, upper=0.42),
         },
         lambda v: Material(models.FixedCorotated(v["E"], v["nu"])),
@@ -87,8 +91,8 @@ def _newtonian() -> Case:
         "Newtonian drop",
         {"viscosity": 200.0, "kappa": 1e5},
         {
-            "viscosity": Parameter(50.0, lower=5.0, upper=1e3, log=True, unit="Pa s"),
-            "kappa": Parameter(4e4, lower=1e4, upper=5e5, log=True, unit="Pa"),
+            "viscosity": Parameter(50.0, lower=5.0, upper=500.0, log=True, unit="Pa s"),
+            "kappa": Parameter(4e4, lower=1e4, upper=2e5, log=True, unit="Pa"),
         },
         lambda v: Material(models.Fluid(v["kappa"], v["viscosity"])),
         {"viscosity": Target("log10", 3e-3, 3e-2), "kappa": Target("log10", 5e-2, None)},
@@ -105,7 +109,7 @@ def _herschel_bulkley() -> Case:
         {"mu": 1e4, "kappa": 1e6, "yield_stress": 3e3, "eta": 10.0},
         {
             "mu": Parameter(3e4, lower=2e3, upper=1e5, log=True, unit="Pa"),
-            "kappa": Parameter(4e5, lower=1e5, upper=3e6, log=True, unit="Pa"),
+            "kappa": Parameter(4e5, lower=1e5, upper=2e6, log=True, unit="Pa"),
             "yield_stress": Parameter(1e3, lower=100.0, upper=2e4, log=True, unit="Pa"),
             "eta": Parameter(30.0, lower=1.0, upper=300.0, log=True, unit="Pa s"),
         },
@@ -127,8 +131,8 @@ def _plasticine() -> Case:
         "plasticine",
         {"E": 2e6, "nu": 0.3, "yield_stress": 1.54e4},
         {
-            "E": Parameter(1e6, lower=2e5, upper=4e6, log=True, unit="Pa"),
-            "nu": Parameter(0.2, lower=0.0, upper=0.42),
+            "E": Parameter(1e6, lower=2e5, upper=3e6, log=True, unit="Pa"),
+            "nu": Parameter(0.2, lower=0.0, upper=0.4),
             "yield_stress": Parameter(5e3, lower=500.0, upper=1e5, log=True, unit="Pa"),
         },
         material,
@@ -160,19 +164,13 @@ def _heterogeneous() -> Case:
         x, volumes = tilted_block((0.36, 0.2, 0.2), (0.0, 0.0, 0.34), resolution)
         order = np.argsort(x[:, 0] > 0, kind="stable")
         x, half = x[order], int(np.sum(x[:, 0] <= 0))
-        grid = resolution.grid((-0.5, -0.5, -0.02), (0.5, 0.5, 0.7))
-        floor = Collider(HalfSpace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), Sticky())
 
         def of(values):
-            scene = pgjax.Scene(
-                grid,
-                [Material(models.FixedCorotated(values[n], 0.3)) for n in ("E1", "E2")],
+            scene = _on_floor(
                 volumes,
+                [Material(models.FixedCorotated(values[n], 0.3)) for n in ("E1", "E2")],
+                resolution,
                 counts=(half, len(x) - half),
-                gravity=GRAVITY,
-                boundaries=[floor],
-                spline=pgjax.BSpline(resolution.spline),
-                scheme=pgjax.MLS(),
             )
             return scene, pgjax.initial_state(scene, x, (0.3, -0.2, -2.0))
 
@@ -239,6 +237,7 @@ def _tumbling(name, truth, parameters, material_of, targets) -> Case:
         substeps=20,
         double=True,
         trials=15,
+        limit=10,
     )
 
 
@@ -344,6 +343,7 @@ def _dam_break(seen: int) -> Case:
         seen=seen,
         double=True,
         trials=15,
+        limit=15,
     )
 
 

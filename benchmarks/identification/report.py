@@ -1,11 +1,12 @@
 """The stored results: JSON, and the same as Markdown."""
 
+import datetime
 import json
-import os
-import platform
 from pathlib import Path
 
 import jax
+
+from benchmarks.speed.report import cpu
 
 COMMAND = "python -m benchmarks.identification"
 
@@ -21,15 +22,15 @@ def line(row: dict) -> str:
         + f"; {e['verdict']})"
         for e in row["estimates"]
     ]
-    return f"{head}: {', '.join(parts)}; {row['trials']} points, {row['seconds']:.0f} s"
+    return f"{head}: {', '.join(parts)}; {row['iterations']} iterations, {row['seconds']:.0f} s"
 
 
 def write(folder: Path, rows: list[dict]) -> None:
     """Both files."""
     folder.mkdir(parents=True, exist_ok=True)
     machine = {
-        "machine": platform.machine(),
-        "threads": len(os.sched_getaffinity(0)),
+        "cpu": cpu(),
+        "date": datetime.date.today().isoformat(),
         "jax": jax.__version__,
         "command": COMMAND,
     }
@@ -43,11 +44,12 @@ def _markdown(machine: dict, rows: list[dict]) -> str:
     lines = [
         "# Identification",
         "",
-        f"`{COMMAND}`; {machine['machine']}, {machine['threads']} threads, JAX {machine['jax']}. "
+        f"`{COMMAND}`; {machine['cpu']}, JAX {machine['jax']}, {machine['date']}. "
         "Tier *self*: data made with the estimator's own discretisation. Tier *cross*: other "
         "particles, spacing / 1.5, half the time step. Errors in decades (log10), as a part of the "
         "truth (relative), or absolute. Intervals are 95 %; *mismatch* is the derivative against "
-        "the secant over the interval.",
+        "the secant over the interval. Iterations are counted over all stages; a tangent counts as "
+        "a simulation.",
         "",
         "| case | tier | unknown | truth | estimate | error | demanded | met | 95 % interval | "
         "mismatch | verdict |",
@@ -68,14 +70,14 @@ def _markdown(machine: dict, rows: list[dict]) -> str:
             )
     lines += [
         "",
-        "| case | tier | cameras | particles | steps | tried | tried on the whole |"
-        " simulations | seconds | ended |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|---|",
+        "| case | tier | cameras | particles | steps | iterations | demanded | simulations | "
+        "seconds | cores | ended |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---|",
     ]
     lines += [
         f"| {r['case']} | {r['tier']} | {r['views'] or 'positions'} | {r['particles']} | "
-        f"{r['steps']} | {r['trials']} | {r['last_descent']} | {r['simulations']} | "
-        f"{r['seconds']:.0f} | {r['reason']} |"
+        f"{r['steps']} | {r['iterations']} | {r['limit'] or ''} | {r['simulations']} | "
+        f"{r['seconds']:.0f} | {r['cores']} | {r['reason']} |"
         for r in rows
         if "error" not in r
     ]

@@ -1,6 +1,7 @@
 """Runs one case: `python -m benchmarks.identification.worker NAME TIER VIEWS`."""
 
 import json
+import os
 import sys
 
 import numpy as np
@@ -14,6 +15,7 @@ def run(name: str, tier: str, views: int) -> dict:
     """One row of the table."""
     case = all_cases()[name]
     made = problem(case, tier, views or None)
+    cores = len(os.sched_getaffinity(0))
     row = {
         "case": name,
         "tier": tier,
@@ -22,6 +24,7 @@ def run(name: str, tier: str, views: int) -> dict:
         "steps": made.frames * made.substeps,
         "degree": case.resolution.spline,
         "double": case.double,
+        "cores": cores,
     }
     try:
         found = fit(
@@ -33,8 +36,9 @@ def run(name: str, tier: str, views: int) -> dict:
         )
     except FitError as error:
         return {**row, "error": str(error)}
-    row["trials"], row["simulations"] = found.iterations, found.simulations
-    row["last_descent"] = _last_descent(found)
+    # The first point of each descent is no iteration.
+    row["iterations"] = found.iterations - len(case.stages) - 1
+    row["limit"], row["simulations"] = case.limit, found.simulations
     row["seconds"], row["converged"] = round(found.seconds, 1), found.converged
     row["reason"], row["messages"] = found.reason, found.messages
     row["noise"] = found.uncertainty.noise
@@ -46,12 +50,6 @@ def _start(made):
     import jax.numpy as jnp
 
     return made.space.values(jnp.asarray(made.space.start, jnp.zeros(()).dtype))
-
-
-def _last_descent(found) -> int:
-    """Points tried on the whole problem."""
-    whole = (tuple(found.problem.names), found.problem.frames)
-    return sum((trial.names, trial.frames) == whole for trial in found.trials)
 
 
 def _estimate(case, tier: str, found, name: str) -> dict:

@@ -9,10 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from benchmarks.render.cases import QUANTITIES
 from benchmarks.render.measure import BOUND, LONG, OWN, PEER, TOO_LONG, Record
 from benchmarks.speed.report import cpu, versions
-from benchmarks.speed.table import note, number
+from benchmarks.speed.table import number
 
 PACKAGES = ("pgjax", "jax", "jaxlib", "numpy", "torch", "gsplat")
 CLOCKS = {
@@ -125,7 +127,7 @@ def page(records: list[Record], facts: dict[str, Any]) -> str:
 
 
 def store(records: list[Record], about: dict[str, Any], folder: Path) -> None:
-    """Write `render_cpu.json`, `.md` and, with matplotlib, `.png`."""
+    """Write `render_cpu.json`, `.md` and `.png`."""
     folder.mkdir(parents=True, exist_ok=True)
     facts = about | {
         "date": datetime.date.today().isoformat(),
@@ -138,38 +140,22 @@ def store(records: list[Record], about: dict[str, Any], folder: Path) -> None:
     text = json.dumps(content, indent=1, ensure_ascii=False)
     (folder / "render_cpu.json").write_text(text + "\n", encoding="utf-8")
     (folder / "render_cpu.md").write_text(page(records, facts), encoding="utf-8")
-    try:
-        draw(records, folder / "render_cpu.png")
-    except ImportError:
-        note('matplotlib is not installed, so no picture: pip install "pgjax[benchmarks]"')
+    draw(records, folder / "render_cpu.png")
 
 
 def draw(records: list[Record], file: Path) -> None:
     """Time against the number of Gaussians: a panel per image size, on the fewest threads."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     threads = min(record.threads for record in records)
     records = sorted((r for r in records if r.threads == threads), key=lambda r: r.gaussians)
     sizes = sorted({record.size for record in records})
-    figure, panels = plt.subplots(
-        1,
-        len(sizes),
-        figsize=(5.5 * len(sizes), 4),
-        layout="constrained",
-        sharex=True,
-        sharey=True,
-        squeeze=False,
-    )
+    figure = Figure(figsize=(5.5 * len(sizes), 4), layout="constrained")
+    panels = figure.subplots(1, len(sizes), sharex=True, sharey=True, squeeze=False)
     for axes, size in zip(panels[0], sizes, strict=True):
         _curves(axes, [record for record in records if record.size == size])
         axes.set_title(f"{size}² pixels, {threads} thread" + "s" * (threads > 1))
     panels[0][0].set_ylabel("ms")
     panels[0][0].legend(fontsize=8)
     figure.savefig(file, dpi=150)
-    plt.close(figure)
 
 
 def _curves(axes: Any, records: list[Record]) -> None:

@@ -9,8 +9,10 @@ import platform
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from benchmarks.speed import cases
-from benchmarks.speed.table import COLUMNS, Row, markdown, note
+from benchmarks.speed.table import COLUMNS, Row, markdown
 
 PACKAGES = ("pgjax", "jax", "jaxlib", "numpy", "taichi", "warp-lang")
 COLORS = ("#1b6ca8", "#7fb2d9", "#d1495b", "#e8a0a8", "#6a994e")
@@ -86,32 +88,24 @@ def page(rows: list[Row], facts: dict[str, Any]) -> str:
 
 
 def store(rows: list[Row], command: str, kernels: str, folder: Path) -> None:
-    """Write `speed_cpu.json`, `.md` and, with matplotlib, `.png`."""
+    """Write `speed_cpu.json`, `.md` and `.png`."""
     folder.mkdir(parents=True, exist_ok=True)
     facts = about(command, kernels)
     content = facts | {"rows": [dataclasses.asdict(row) for row in rows]}
     text = json.dumps(content, indent=1, ensure_ascii=False)
     (folder / "speed_cpu.json").write_text(text + "\n", encoding="utf-8")
     (folder / "speed_cpu.md").write_text(page(rows, facts), encoding="utf-8")
-    try:
-        draw(rows, folder / "speed_cpu.png")
-    except ImportError:
-        note('matplotlib is not installed, so no picture: pip install "pgjax[benchmarks]"')
+    draw(rows, folder / "speed_cpu.png")
 
 
 def draw(rows: list[Row], file: Path) -> None:
     """Bars by material and code at one size, and the cost against the number of particles."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     costs = [row for row in rows if row.quantity == "forward" and row.threads == 1]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     _bars(left, costs)
     _curves(right, costs)
     figure.savefig(file, dpi=150)
-    plt.close(figure)
 
 
 def _bars(axes: Any, costs: list[Row]) -> None:

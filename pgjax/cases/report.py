@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pgjax._files import replacing
+from pgjax.cases.plots import plot_convergence
 from pgjax.cases.schema import CaseFile
 from pgjax.inverse import Fit
 from pgjax.render import save_image
@@ -37,14 +38,19 @@ class Comparison:
 
 
 def write_report(
-    out: Path, case: CaseFile, found: Fit, comparisons: list[Comparison], notes: tuple[str, ...]
+    out: Path,
+    case: CaseFile,
+    found: Fit,
+    dt: float,
+    comparisons: list[Comparison],
+    notes: tuple[str, ...],
 ) -> Path:
     """Write `report.md` and its pictures; returns its path."""
     lines = [f"# {case.name}", ""]
-    lines += _estimates(found)
+    lines += _estimates(found, dt)
     lines += _notes([*notes, *found.messages])
     lines += _uncertainty(found)
-    lines += _convergence(found)
+    lines += _convergence(out, found)
     lines += _prediction(out, case, comparisons)
     path = out / "report.md"
     with replacing(path) as temporary:
@@ -52,7 +58,7 @@ def write_report(
     return path
 
 
-def _estimates(found: Fit) -> list[str]:
+def _estimates(found: Fit, dt: float) -> list[str]:
     lines = [
         "| parameter | estimate | 90 % interval | 95 % interval | unit | verdict |",
         "|---|---:|---|---|---|---|",
@@ -70,7 +76,7 @@ def _estimates(found: Fit) -> list[str]:
         "",
         f"{'Converged' if found.converged else 'Stopped'}: {found.reason}. "
         f"{found.iterations} points, {found.simulations} simulations (a tangent counts as one), "
-        f"{found.seconds:.0f} s. Time step {found.problem.dt:.4g} s, the same throughout.",
+        f"{found.seconds:.0f} s. Time step {dt:.4g} s, the same throughout.",
         "",
     ]
 
@@ -102,10 +108,16 @@ def _uncertainty(found: Fit) -> list[str]:
     return [*lines, ""]
 
 
-def _convergence(found: Fit) -> list[str]:
+def _convergence(out: Path, found: Fit) -> list[str]:
     names = found.problem.names
+    drawn = plot_convergence(found, out / "convergence.png")
     lines = [
         "## Convergence",
+        "",
+        "![convergence](convergence.png)",
+        "",
+        "Every point that was tried; red ones were rejected, green bands are the 95 % intervals"
+        + (f" (the first {len(drawn)} parameters)." if len(drawn) < len(names) else "."),
         "",
         "| s | frames | cost | " + " | ".join(f"`{n}`" for n in names) + " | |",
         "|---:|---:|---:|" + "---:|" * len(names) + "---|",

@@ -196,11 +196,12 @@ def solve(
         report=report,
     )
     out.mkdir(parents=True, exist_ok=True)
-    content = fitted_content(case, found.values, found.problem.dt)
+    dt = prepared.problem.dt
+    content = fitted_content(case, found.values, dt)
     with replacing(out / "fitted.toml") as temporary:
         temporary.write_bytes(tomli_w.dumps(content).encode())
     comparisons, told = _compared(prepared, found)
-    return found, write_report(out, case, found, comparisons, (*prepared.notes, *told))
+    return found, write_report(out, case, found, dt, comparisons, (*prepared.notes, *told))
 
 
 def _compared(prepared: Prepared, found: Fit) -> tuple[list[Comparison], list[str]]:
@@ -216,4 +217,4 @@ def _compared(prepared: Prepared, found: Fit) -> tuple[list[Comparison], list[st
                 frames, np.asarray(o.data), np.asarray(seen)[frames], isinstance(o, Pictures)
             )
         )
-    return made, status.messages() if whole.frames > found.problem.frames else []
+    return made, status.messages() if whole.last > found.problem.last else []

@@ -12,6 +12,7 @@ from pgjax.inverse.information import Profile as Profile
 from pgjax.inverse.information import information as information
 from pgjax.inverse.information import profile as profile
 from pgjax.inverse.information import would_help as would_help
+from pgjax.inverse.joint import Joint as Joint
 from pgjax.inverse.levenberg import FitError as FitError
 from pgjax.inverse.losses import Cauchy as Cauchy
 from pgjax.inverse.losses import Huber as Huber

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pgjax.inverse.levenberg import FitError, evaluate
-from pgjax.inverse.problem import Problem, cost_and_slope, outcome
+from pgjax.inverse.problem import AbstractProblem, cost_and_slope, outcome
 
 
 class GradientCheck(NamedTuple):
@@ -43,7 +43,7 @@ class GradientCheck(NamedTuple):
 
 
 def gradient_check(
-    problem: Problem,
+    problem: AbstractProblem,
     values: dict[str, Any] | None = None,
     *,
     steps: tuple[float, ...] = (1e-2, 1e-3, 1e-4, 1e-5),

@@ -12,7 +12,7 @@ import optax
 
 from pgjax._types import Array
 from pgjax.inverse.levenberg import FitError
-from pgjax.inverse.problem import Problem
+from pgjax.inverse.problem import AbstractProblem
 
 
 class Step(NamedTuple):
@@ -126,7 +126,7 @@ def _norm(tree: Any) -> Array:
 
 
 def descend_problem(
-    problem: Problem,
+    problem: AbstractProblem,
     *,
     steps: int,
     optimizer: optax.GradientTransformation | None = None,

@@ -16,7 +16,7 @@ from pgjax.inverse.levenberg import (
     Trial,
     levenberg_marquardt,
 )
-from pgjax.inverse.problem import Problem, costs
+from pgjax.inverse.problem import AbstractProblem, costs
 from pgjax.inverse.uncertainty import Uncertainty, uncertainty
 
 # Starts that are simulated at once, and how many of them are followed to their end.
@@ -56,7 +56,7 @@ class Fit:
         seconds: wall time, compiling included.
     """
 
-    problem: Problem
+    problem: AbstractProblem
     values: dict[str, np.ndarray]
     point: Point
     start: np.ndarray
@@ -101,7 +101,7 @@ class Fit:
 
 
 def fit(
-    problem: Problem,
+    problem: AbstractProblem,
     *,
     stages: Sequence[Stage] = (),
     starts: int = 1,
@@ -183,7 +183,7 @@ class _Run:
 
     def __init__(
         self,
-        problem: Problem,
+        problem: AbstractProblem,
         most: int,
         tolerance: float,
         report: Callable[[str], None] | None,
@@ -228,7 +228,7 @@ class _Run:
             u = space.vector({n: values[n] for n in space.free})
         return self._descend(self.problem, u)
 
-    def _descend(self, problem: Problem, u: np.ndarray) -> Descent:
+    def _descend(self, problem: AbstractProblem, u: np.ndarray) -> Descent:
         def told(trial: Trial) -> None:
             self.simulations += 1 + problem.space.size
             seconds = time.perf_counter() - self._began
@@ -241,7 +241,7 @@ class _Run:
         )
 
 
-def _line(problem: Problem, trial: Trial, seconds: float) -> str:
+def _line(problem: AbstractProblem, trial: Trial, seconds: float) -> str:
     values = problem.space.known(trial.u)
     shown = ", ".join(
         f"{name} {np.array2string(values[name], precision=5)}"
@@ -253,7 +253,7 @@ def _line(problem: Problem, trial: Trial, seconds: float) -> str:
 
 
 def _messages(
-    problem: Problem, best: Descent, others: list[Descent], failures: list[FitError]
+    problem: AbstractProblem, best: Descent, others: list[Descent], failures: list[FitError]
 ) -> list[str]:
     """What a reader of the estimate has to know."""
     messages = []

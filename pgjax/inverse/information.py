@@ -8,7 +8,7 @@ from scipy import stats
 
 from pgjax.inverse.fitting import Fit, fit
 from pgjax.inverse.levenberg import FitError, evaluate
-from pgjax.inverse.problem import Problem
+from pgjax.inverse.problem import AbstractProblem
 from pgjax.inverse.uncertainty import covariance_of, noise_of
 
 
@@ -87,7 +87,7 @@ def profile(
     )
 
 
-def information(problem: Problem, values: Mapping[str, Any]) -> np.ndarray:
+def information(problem: AbstractProblem, values: Mapping[str, Any]) -> np.ndarray:
     """Fisher information `JᵀJ` of the data alone about the free coordinates, `(p, p)`.
 
     Raises:
@@ -99,7 +99,7 @@ def information(problem: Problem, values: Mapping[str, Any]) -> np.ndarray:
     return point.rows @ point.rows.T
 
 
-def would_help(found: Fit, candidates: Mapping[str, Problem]) -> dict[str, np.ndarray]:
+def would_help(found: Fit, candidates: Mapping[str, AbstractProblem]) -> dict[str, np.ndarray]:
     """Standard deviations to expect if one of these were observed as well.
 
     Args:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from pgjax.inverse.problem import Problem, linearised
-from pgjax.result import ERRORS, Status
+from pgjax.inverse.problem import AbstractProblem, linearised
+from pgjax.result import ERRORS, Condition, Status
 
 
 class Point(NamedTuple):
@@ -88,7 +88,7 @@ class FitError(RuntimeError):
     """The first guess cannot be used: its simulation fails, or a parameter has no influence."""
 
 
-def evaluate(problem: Problem, u: np.ndarray) -> Point:
+def evaluate(problem: AbstractProblem, u: np.ndarray) -> Point:
     """Simulate with tangents; what can go wrong is named, not raised."""
     result, rows = linearised(problem, jnp.asarray(u, jnp.zeros(()).dtype))
     residual = np.asarray(result.residual, np.float64)
@@ -106,7 +106,7 @@ def evaluate(problem: Problem, u: np.ndarray) -> Point:
     return Point(np.array(u), cost, residual, rows, prior, prior_rows, failure, result.status)
 
 
-def without_influence(problem: Problem, point: Point) -> list[str]:
+def without_influence(problem: AbstractProblem, point: Point) -> list[str]:
     """Names of the coordinates on which the residual does not depend, but for rounding."""
     # Of a change by one, or by itself where it is larger: units do not count.
     sizes = np.linalg.norm(point.rows, axis=1) * np.maximum(1, np.abs(point.u))
@@ -116,7 +116,7 @@ def without_influence(problem: Problem, point: Point) -> list[str]:
 
 
 def levenberg_marquardt(
-    problem: Problem,
+    problem: AbstractProblem,
     start: np.ndarray,
     *,
     trials: int,
@@ -126,9 +126,10 @@ def levenberg_marquardt(
 ) -> Descent:
     """Least squares from one start.
 
-    A trial that fails (a particle lost, NaN, a parameter that loses all influence because nothing
-    yields any more) is rejected and the trust region shrinks; the time step is never changed. Steps
-    that would leave the bounds end on them.
+    A trial that fails (a particle lost, NaN, a motion too fast or too much compressed for the time
+    step, a parameter that loses all influence because nothing yields any more) is rejected and the
+    trust region shrinks; the time step is never changed. Steps that would leave the bounds end on
+    them.
 
     Args:
         problem: what to solve.
@@ -153,7 +154,7 @@ def levenberg_marquardt(
         cost = np.inf if point.failure else point.cost
         seconds = time.perf_counter() - began
         names = tuple(problem.names)
-        history.append(Trial(names, problem.frames, point.u, cost, taken, note, seconds))
+        history.append(Trial(names, problem.last, point.u, cost, taken, note, seconds))
         if report is not None:
             report(history[-1])
 
@@ -163,7 +164,7 @@ def levenberg_marquardt(
         raise FitError(f"The simulation at {_told(problem, start)} fails: {current.failure}")
     if silent:
         raise FitError(
-            f"{', '.join(silent)} has no influence on what is observed of {problem.frames} frames "
+            f"{', '.join(silent)} has no influence on what is observed of {problem.last} frames "
             f"at {_told(problem, start)} (nothing yields, touches, or moves there). Choose another "
             "start, or observe more frames."
         )
@@ -185,7 +186,7 @@ def levenberg_marquardt(
             return Descent(current, history, False, "no step lowers the cost any more")
         trial = evaluate(problem, current.u + step)
         lost = without_influence(problem, trial) if trial.failure is None else []
-        note = trial.failure or ""
+        note = trial.failure or _unstable(current, trial)
         if lost:
             note = f"{', '.join(lost)} would lose all influence"
         gained = 0.0 if note else current.cost - trial.cost
@@ -201,6 +202,14 @@ def levenberg_marquardt(
             damping *= growth
             growth *= 4
     return Descent(current, history, False, f"{trials} points were tried")
+
+
+def _unstable(current: Point, trial: Point) -> str:
+    """Whether the time step, which was small enough so far, is not for a trial."""
+    above = (Condition.DT_ABOVE_BOUND,)
+    if current.status.messages(above):
+        return ""
+    return " ".join(trial.status.messages(above))
 
 
 def _size(step: np.ndarray, u: np.ndarray) -> float:
@@ -234,7 +243,7 @@ def _shortened(step: np.ndarray, logarithmic: np.ndarray, longest: float) -> np.
     return step if largest <= longest else step * (longest / largest)
 
 
-def _told(problem: Problem, u: np.ndarray) -> str:
+def _told(problem: AbstractProblem, u: np.ndarray) -> str:
     """Values of the free parameters in words, as far as there are few."""
     values = problem.space.known(u)
     return ", ".join(

@@ -1,5 +1,6 @@
 """An identification problem: unknowns, the simulation they give, and what was recorded of it."""
 
+import abc
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, final
 
@@ -47,8 +48,63 @@ class Outcome(NamedTuple):
         return self.status.ok & jnp.all(jnp.isfinite(self.residual), axis=-1)
 
 
+class AbstractProblem(eqx.Module):
+    """What a solver asks for: unknowns, and the residual they give.
+
+    Attributes:
+        space: the unknowns.
+    """
+
+    space: eqx.AbstractVar[Space]
+
+    @property
+    def names(self) -> list[str]:
+        """Of the free coordinates."""
+        return self.space.names
+
+    @property
+    @abc.abstractmethod
+    def last(self) -> int:
+        """Number of the last frame that is simulated."""
+
+    @property
+    @abc.abstractmethod
+    def watched(self) -> tuple[AbstractObservation, ...]:
+        """Everything that is compared."""
+
+    @abc.abstractmethod
+    def outcome(self, u: Float[Array, " size"]) -> Outcome:
+        """Simulate at free coordinates u and compare. Pure; differentiable in u."""
+
+    @abc.abstractmethod
+    def until(self, frame: int) -> "AbstractProblem":
+        """The problem of what was recorded up to a frame, with the same time step.
+
+        Raises:
+            ValueError: nothing was recorded by then.
+        """
+
+    @abc.abstractmethod
+    def with_space(self, space: Space) -> "AbstractProblem":
+        """The same motion and data with other starts, or others of the parameters fixed."""
+
+    def freeing(self, names: Sequence[str], values: Mapping[str, Any]) -> "AbstractProblem":
+        """The problem in which these parameters alone are free, the others fixed at `values`."""
+        unknown = sorted(set(names) - set(self.space.free))
+        if unknown:
+            raise ValueError(
+                f"Argument `names` must name free parameters ({', '.join(self.space.free)}), but "
+                f"names {', '.join(unknown)}."
+            )
+        parameters = {
+            name: p.replace(start=np.asarray(values[name]), fixed=p.fixed or name not in names)
+            for name, p in self.space.parameters.items()
+        }
+        return self.with_space(Space(parameters))
+
+
 @final
-class Problem(eqx.Module):
+class Problem(AbstractProblem):
     """Which parameters make the simulation look like the data.
 
     The time step is decided once, for the stiffest scene the bounds allow, and is the same for
@@ -112,9 +168,14 @@ class Problem(eqx.Module):
         return self.frame_dt / self.substeps
 
     @property
-    def names(self) -> list[str]:
-        """Of the free coordinates."""
-        return self.space.names
+    def last(self) -> int:
+        """Number of the last frame that is simulated."""
+        return self.frames
+
+    @property
+    def watched(self) -> tuple[AbstractObservation, ...]:
+        """Everything that is compared."""
+        return self.observations
 
     def until(self, frame: int) -> "Problem":
         """The problem of what was recorded up to a frame, with the same time step.
@@ -130,19 +191,9 @@ class Problem(eqx.Module):
             )
         return self._with(self.space, tuple(kept), min(frame, self.frames))
 
-    def freeing(self, names: Sequence[str], values: Mapping[str, Any]) -> "Problem":
-        """The problem in which these parameters alone are free, the others fixed at `values`."""
-        unknown = sorted(set(names) - set(self.space.free))
-        if unknown:
-            raise ValueError(
-                f"Argument `names` must name free parameters ({', '.join(self.space.free)}), but "
-                f"names {', '.join(unknown)}."
-            )
-        parameters = {
-            name: p.replace(start=np.asarray(values[name]), fixed=p.fixed or name not in names)
-            for name, p in self.space.parameters.items()
-        }
-        return self._with(Space(parameters), self.observations, self.frames)
+    def with_space(self, space: Space) -> "Problem":
+        """The same motion and data with other starts, or others of the parameters fixed."""
+        return self._with(space, self.observations, self.frames)
 
     def observing(
         self, observations: AbstractObservation | Sequence[AbstractObservation]
@@ -172,7 +223,10 @@ class Problem(eqx.Module):
 
     def see(self, u: Float[Array, " size"]) -> tuple[tuple[Any, ...], Status]:
         """What each observation would see of all frames at free coordinates u, and the status."""
-        scene, state = self.build(self.space.values(u))
+        return self._see(self.space.values(u))
+
+    def _see(self, values: Values) -> tuple[tuple[Any, ...], Status]:
+        scene, state = self.build(values)
         trajectory = simulate(
             scene,
             state,
@@ -187,11 +241,15 @@ class Problem(eqx.Module):
 
     def outcome(self, u: Float[Array, " size"]) -> Outcome:
         """Simulate at free coordinates u and compare. Pure; differentiable in u."""
-        saved, status = self.see(u)
+        residual, status = self.compared(self.space.values(u))
+        return Outcome(residual, self.space.prior_residual(u).astype(residual.dtype), status)
+
+    def compared(self, values: Values) -> tuple[Float[Array, " m"], Status]:
+        """Residual of the data and status at values by name."""
+        saved, status = self._see(values)
         parts = [o.residual(seen) for o, seen in zip(self.observations, saved, strict=True)]
         dtype = jnp.result_type(*parts)
-        residual = jnp.concatenate([part.astype(dtype) for part in parts])
-        return Outcome(residual, self.space.prior_residual(u).astype(dtype), status)
+        return jnp.concatenate([part.astype(dtype) for part in parts]), status
 
 
 @final
@@ -203,14 +261,14 @@ class _Seen(eqx.Module):
 
 
 @eqx.filter_jit
-def outcome(problem: Problem, u: Float[Array, " size"]) -> Outcome:
+def outcome(problem: AbstractProblem, u: Float[Array, " size"]) -> Outcome:
     """`problem.outcome`, compiled."""
     return problem.outcome(u)
 
 
 @eqx.filter_jit
 def costs(
-    problem: Problem, us: Float[Array, "n size"], at_once: int
+    problem: AbstractProblem, us: Float[Array, "n size"], at_once: int
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Costs of several points, and which of the simulations can be used."""
 
@@ -222,7 +280,9 @@ def costs(
 
 
 @eqx.filter_jit
-def linearised(problem: Problem, u: Float[Array, " size"]) -> tuple[Outcome, Float[Array, "p m"]]:
+def linearised(
+    problem: AbstractProblem, u: Float[Array, " size"]
+) -> tuple[Outcome, Float[Array, "p m"]]:
     """Outcome and the rows `∂r/∂u_j`, in forward mode, one tangent per coordinate.
 
     Up to eight tangents are computed beside one run.
@@ -248,7 +308,7 @@ def linearised(problem: Problem, u: Float[Array, " size"]) -> tuple[Outcome, Flo
 
 @eqx.filter_jit
 def cost_and_slope(
-    problem: Problem, u: Float[Array, " size"]
+    problem: AbstractProblem, u: Float[Array, " size"]
 ) -> tuple[Outcome, Float[Array, " size"]]:
     """Outcome and the gradient of its cost, in reverse mode through checkpointed steps."""
 

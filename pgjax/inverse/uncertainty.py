@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from pgjax.inverse.levenberg import Point
-from pgjax.inverse.problem import Problem, outcome
+from pgjax.inverse.problem import AbstractProblem, outcome
 
 # A derivative that is off the secant over its own interval by more than this part is not trusted.
 LARGEST_MISMATCH = 0.2
@@ -134,7 +134,9 @@ class Uncertainty:
         ]
 
 
-def uncertainty(problem: Problem, point: Point, *, noise_known: bool = False) -> Uncertainty:
+def uncertainty(
+    problem: AbstractProblem, point: Point, *, noise_known: bool = False
+) -> Uncertainty:
     """The uncertainty of an estimate; two more simulations per coordinate check the derivative.
 
     Along the direction in which a coordinate reaches the end of its 95 % interval, the derivative
@@ -174,7 +176,7 @@ def uncertainty(problem: Problem, point: Point, *, noise_known: bool = False) ->
     )
 
 
-def noise_of(problem: Problem, point: Point, *, known: bool) -> tuple[float, float]:
+def noise_of(problem: AbstractProblem, point: Point, *, known: bool) -> tuple[float, float]:
     """Standard deviation of the residual at an estimate, and its degrees of freedom.
 
     Data that no parameter changes (background, what is missing) say nothing about it. With a robust
@@ -186,7 +188,7 @@ def noise_of(problem: Problem, point: Point, *, known: bool) -> tuple[float, flo
     if known or degrees < 1:
         return 1.0, float("inf")
     residual = point.residual[counts]
-    if any(o.robust is not None for o in problem.observations):
+    if any(o.robust is not None for o in problem.watched):
         spread = float(np.median(np.abs(residual)) / stats.norm.ppf(0.75))
         return max(spread, _LEAST_NOISE), float(degrees)
     return max(float(np.sqrt(residual @ residual / degrees)), _LEAST_NOISE), float(degrees)
@@ -207,7 +209,7 @@ class _Check(NamedTuple):
 
 
 def _against_secant(
-    problem: Problem,
+    problem: AbstractProblem,
     point: Point,
     covariance: np.ndarray,
     noise: float,
@@ -251,7 +253,7 @@ def _against_secant(
     return _Check(mismatch, max(1.0, 1 / along, np.sqrt(1 + mismatch**2)), "")
 
 
-def _too_wide(problem: Problem, u: np.ndarray, half: np.ndarray, j: int) -> str:
+def _too_wide(problem: AbstractProblem, u: np.ndarray, half: np.ndarray, j: int) -> str:
     """Why an interval says nothing; empty if it says something."""
     lower, upper = problem.space.bounds()
     if problem.space.logarithmic[j] and 2 * half[j] > WIDEST_LOGARITHM:
