@@ -1,6 +1,7 @@
 """pgjax: a differentiable Material Point Method simulator for scenes captured as Gaussians."""
 
 from pgjax.grid import Grid as Grid
+from pgjax.ledger import Ledger as Ledger
 from pgjax.result import Condition as Condition
 from pgjax.result import SimulationError as SimulationError
 from pgjax.result import SimulationWarning as SimulationWarning

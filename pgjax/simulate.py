@@ -12,11 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from pgjax._types import Array, Float, Scalar, concrete
+from pgjax.ledger import Flows, Ledger, balance, followed
 from pgjax.monitor import note_frame, note_start
 from pgjax.result import SimulationWarning, Status
 from pgjax.scene import Scene
 from pgjax.state import State
-from pgjax.step import step
+from pgjax.step import followed_step, step
+
+# What a rollout carries: the state, and what flowed where a ledger is kept.
+Carry = tuple[State, Flows | None]
 
 
 @final
@@ -49,12 +53,27 @@ class Trajectory(eqx.Module):
         t: times of the entries, s, `(frames + 1,)`.
         final: the last state; pass it to `simulate` to go on.
         status: per condition, the first step and a count.
+        ledger: the accounts of each entry, with `simulate(ledger=True)`.
     """
 
     saved: Any
     t: Float[Array, "*batch _"]
     final: State
     status: Status
+    ledger: Ledger | None = None
+
+    def plot(self) -> Any:
+        """Draw energies, momenta, the size of the steps and the smallest volume over time.
+
+        Returns:
+            A `matplotlib.figure.Figure`, which a notebook shows and `savefig` writes.
+
+        Raises:
+            ValueError: there is no ledger.
+        """
+        if self.ledger is None:
+            raise ValueError("A trajectory must have a ledger to be drawn: simulate(ledger=True).")
+        return self.ledger.plot(self.t)
 
 
 def simulate(
@@ -69,6 +88,7 @@ def simulate(
     throw: bool = True,
     allow_unstable: bool = False,
     keep_states: bool = False,
+    ledger: bool = False,
 ) -> Trajectory:
     """Run `frames × substeps` steps and keep `save(state)` of every frame, the first included.
 
@@ -89,6 +109,9 @@ def simulate(
         allow_unstable: accept a time step above the stable one.
         keep_states: reverse mode keeps the state of every step (T of them, and those of one frame
             once more), and so runs forward once less.
+        ledger: keep accounts of mass, momenta and energies, and of what walls, forces and plastic
+            flow put in and take out: `trajectory.ledger`. The motion is the same; a step costs
+            about twice as much.
 
     Raises:
         ValueError: an argument is out of range, or dt is above the stable bound at rest.
@@ -102,7 +125,15 @@ def simulate(
     _check_dt(scene, dt, allow_unstable)
     report = _meter(frames) if progress is True else progress or None
     trajectory = _rollout(
-        scene, state, jnp.asarray(dt, state.dtype), frames, substeps, save, report, keep_states
+        scene,
+        state,
+        jnp.asarray(dt, state.dtype),
+        frames,
+        substeps,
+        save,
+        report,
+        keep_states,
+        ledger,
     )
     if throw:
         trajectory.status.check()
@@ -154,42 +185,55 @@ def _rollout(
     save: Callable[[State], Any],
     report: Callable[[int, int], None] | None,
     keep_states: bool,
+    ledger: bool,
 ) -> Trajectory:
     """The nested scans. Frames are grouped, or divided, so that a block has about √T steps."""
     root = math.sqrt(frames * substeps)
     block = substeps if keep_states else math.ceil(root)
     group = frames if keep_states else max(1, round(root / substeps))
 
-    def frame(state: State, index: Array) -> tuple[State, Any]:
-        advance = jax.checkpoint(lambda s: step(scene, s, dt))
-        state = repeated(advance, state, substeps, block=block)
-        state = note_frame(scene, state, dt)
+    def advance(carry: Carry) -> Carry:
+        state, flows = carry
+        if flows is None:
+            return step(scene, state, dt), None
+        stages = followed_step(scene, state, dt)
+        return stages.after, followed(scene, state, stages, flows, dt)
+
+    def kept(carry: Carry) -> tuple[Any, Ledger | None]:
+        state, flows = carry
+        return save(state), None if flows is None else balance(scene, state, flows, dt)
+
+    def frame(carry: Carry, index: Array) -> tuple[Carry, Any]:
+        state, flows = repeated(jax.checkpoint(lambda c: advance(c)), carry, substeps, block=block)
+        carry = note_frame(scene, state, dt), flows
         if report is not None:
             jax.debug.callback(functools.partial(_call, report), index, frames)
         # A function of its own: `save` may be a module that holds traced arrays.
-        return state, jax.checkpoint(lambda s: save(s))(state)
+        return carry, jax.checkpoint(lambda c: kept(c))(carry)
 
-    state = note_start(scene, state, dt)
-    first = save(state)
+    start: Carry = note_start(scene, state, dt), Flows.none(state) if ledger else None
+    first = kept(start)
     if substeps > block:
         # The blocks of steps inside a frame bound its memory already.
-        final, rest = jax.lax.scan(frame, state, jnp.arange(frames, dtype=jnp.int32))
+        end, rest = jax.lax.scan(frame, start, jnp.arange(frames, dtype=jnp.int32))
     else:
-        final, rest = checkpointed_scan(frame, state, frames, group=group)
-    saved = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, rest)
+        end, rest = checkpointed_scan(frame, start, frames, group=group)
+    saved, accounts = jax.tree.map(
+        lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, rest
+    )
     t = (state.step + substeps * jnp.arange(frames + 1, dtype=jnp.int32)).astype(dt.dtype) * dt
-    return Trajectory(saved, t, final, final.status)
+    return Trajectory(saved, t, end[0], end[0].status, accounts)
 
 
-def repeated(advance: Callable[[State], State], state: State, count: int, *, block: int) -> State:
+def repeated(advance: Callable[[Any], Any], state: Any, count: int, *, block: int) -> Any:
     """Apply `advance` count times; reverse mode keeps the states between blocks only."""
     final, _ = checkpointed_scan(lambda s, _: (advance(s), None), state, count, group=block)
     return final
 
 
 def checkpointed_scan(
-    body: Callable[[State, Array], tuple[State, Any]], state: State, count: int, *, group: int
-) -> tuple[State, Any]:
+    body: Callable[[Any, Array], tuple[Any, Any]], state: Any, count: int, *, group: int
+) -> tuple[Any, Any]:
     """`lax.scan(body, state, arange(count))`, rematerialised in groups of about `group`."""
     group = min(group, count)
     if group == 1 or group == count:
@@ -198,7 +242,7 @@ def checkpointed_scan(
     group = _even_group(count, group)
     groups = -(-count // group)
 
-    def one(state: State, index: Array) -> tuple[State, Any]:
+    def one(state: Any, index: Array) -> tuple[Any, Any]:
         if groups * group == count:
             return body(state, index)
         # The last group is filled up with steps that are skipped.
@@ -207,7 +251,7 @@ def checkpointed_scan(
         return jax.lax.cond(index < count, body, lambda s, _: (s, nothing), state, index)
 
     @jax.checkpoint
-    def many(state: State, indices: Array) -> tuple[State, Any]:
+    def many(state: Any, indices: Array) -> tuple[Any, Any]:
         return jax.lax.scan(one, state, indices)
 
     indices = jnp.arange(groups * group, dtype=jnp.int32).reshape(groups, group)

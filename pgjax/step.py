@@ -1,7 +1,7 @@
 """One time step of the Material Point Method, written as the algorithm reads."""
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -51,15 +51,37 @@ def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
     Returns:
         The state one step later. Differentiable in every array of `scene` and `state`.
     """
+    return followed_step(scene, state, dt).after
+
+
+class Stages(NamedTuple):
+    """What a step passes through.
+
+    Attributes:
+        imposed: the state under forces and prescribed motion of particles.
+        nodes: momentum and mass of the nodes, internal forces already in the momentum.
+        moved: their velocity under gravity, damping and walls, and their mass.
+        after: the state one step later.
+    """
+
+    imposed: State
+    nodes: Float[Array, "*grid c"]
+    moved: Float[Array, "*grid c"]
+    after: State
+
+
+def followed_step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> Stages:
+    """`step` with what lies between, for whoever keeps accounts."""
     scene = cast(scene, state.dtype)
     dt = jnp.asarray(dt, state.dtype)
     t = state.step.astype(state.dtype) * dt
 
-    held, state = _impose(scene, state, t, dt)
-    at, inside = stencil(scene.grid, scene.spline, state.position)
-    state, finite, momentum_and_mass = _particles_to_grid(scene, state, at, inside, t, dt)
-    grid_v = _forces_and_boundaries(scene, at, momentum_and_mass, t, dt)
-    return _grid_to_particles(scene, state, at, finite, held, grid_v, dt)
+    held, imposed = _impose(scene, state, t, dt)
+    at, inside = stencil(scene.grid, scene.spline, imposed.position)
+    sent, finite, nodes = _particles_to_grid(scene, imposed, at, inside, t, dt)
+    moved = _forces_and_boundaries(scene, at, nodes, t, dt)
+    after = _grid_to_particles(scene, sent, at, finite, held, moved, dt)
+    return Stages(imposed, nodes, moved, after)
 
 
 def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Array, " p"], State]:

@@ -182,7 +182,7 @@ class Box(AbstractGridCondition):
             v = change_if(low | high, walls, v)
         return v
 
-    def sides(self, axes: Sequence[Float[Array, " n"]]) -> list[Int[Array, " n"]]:
+    def sides(self, axes: Sequence[Float[Array, " _"]]) -> list[Int[Array, " _"]]:
         """For the nodes of a grid along each direction: −1 behind the lower wall, 1 the upper."""
         farthest = jnp.stack([jnp.max(jnp.abs(x)) for x in axes])
         found = []

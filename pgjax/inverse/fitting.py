@@ -21,6 +21,8 @@ from pgjax.inverse.uncertainty import Uncertainty, uncertainty
 
 # Starts that are simulated at once, and how many of them are followed to their end.
 _AT_ONCE, _FOLLOWED = 8, 3
+# A stage only has to come near: what follows starts there.
+_STAGE_TOLERANCE = 1e-3
 
 
 class Stage(NamedTuple):
@@ -224,11 +226,12 @@ class _Run:
             if stage.free is not None:
                 part = part.freeing(stage.free, values)
             own = part.space.vector({n: values[n] for n in part.space.free})
-            values = part.space.known(self._descend(part, own).best.u)
+            end = self._descend(part, own, max(self.tolerance, _STAGE_TOLERANCE))
+            values = part.space.known(end.best.u)
             u = space.vector({n: values[n] for n in space.free})
-        return self._descend(self.problem, u)
+        return self._descend(self.problem, u, self.tolerance)
 
-    def _descend(self, problem: AbstractProblem, u: np.ndarray) -> Descent:
+    def _descend(self, problem: AbstractProblem, u: np.ndarray, tolerance: float) -> Descent:
         def told(trial: Trial) -> None:
             self.simulations += 1 + problem.space.size
             seconds = time.perf_counter() - self._began
@@ -236,9 +239,7 @@ class _Run:
             if self.report is not None:
                 self.report(_line(problem, trial, seconds))
 
-        return levenberg_marquardt(
-            problem, u, trials=self.most, tolerance=self.tolerance, report=told
-        )
+        return levenberg_marquardt(problem, u, trials=self.most, tolerance=tolerance, report=told)
 
 
 def _line(problem: AbstractProblem, trial: Trial, seconds: float) -> str:

@@ -11,6 +11,10 @@ from scipy.optimize import lsq_linear
 from pgjax.inverse.problem import AbstractProblem, linearised
 from pgjax.result import ERRORS, Condition, Status
 
+# A fall of the cost by a tenth of a standard deviation of the noise that was given: rounding may
+# hide it, and it says nothing.
+_WORTHLESS = 0.1**2 / 2
+
 
 class Point(NamedTuple):
     """The residual and its derivative at one point.
@@ -194,6 +198,8 @@ def levenberg_marquardt(
         ratio = gained / promised if promised > 0 else 0.0
         taken = not note and bool(ratio > 1e-4)
         remember(trial, taken, note or ("" if taken else "the cost would not fall"))
+        if not taken and not note and _promised(current, undamped) <= _WORTHLESS:
+            return Descent(current, history, True, "what is left to gain is below the noise")
         if taken:
             current = trial
             damping *= max(1 / 3, 1 - (2 * ratio - 1) ** 3)

@@ -44,6 +44,12 @@ class AbstractLaw(eqx.Module):
     def rest_modulus(self, dimension: int) -> Array:
         """`ρ₀ c²` at rest, Pa: one value, or one per particle where the parameters are."""
 
+    def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
+        """Stored energy per rest volume, J/m³, from elastic `H = Fe − I`; a `Ledger` needs it."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has no `energy(H, history)`, which a ledger needs."
+        )
+
     def kernel(self) -> str | None:
         """The name in `elasticity.RESPONSES` of a law that is a function of H, μ and λ alone."""
         return None
