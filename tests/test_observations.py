@@ -19,6 +19,7 @@ from pgjax.inverse import (
     Positions,
     Problem,
     Sinkhorn,
+    Stage,
     descend,
     fit,
     gradient_check,
@@ -109,6 +110,42 @@ def test_fit_from_silhouettes():
     known = parameters(nu=Parameter(0.3, fixed=True), E=Parameter(2e4, fixed=True))
     found = fit(pictured("silhouette", 2, frames=3, unknowns=known), tolerance=1e-4)
     np.testing.assert_allclose(found.values["v0"], TRUTH["v0"], atol=5e-3)
+
+
+def test_squares_are_averages():
+    """Of the differences, over the noise of an average; what is missing counts as no difference."""
+    problem = pictured("rgb", 2, frames=2)
+    (exact,) = problem.observations
+    rng = np.random.default_rng(0)
+    seen = np.asarray(exact.data) + 0.01 * rng.standard_normal(exact.data.shape)
+    seen = jnp.asarray(seen, exact.data.dtype)
+    exact = eqx.tree_at(lambda o: o.data, exact, exact.data.at[0, 0, :5, :5].set(jnp.nan))
+    single = np.asarray(exact.compare(seen))
+    assert single.shape == (2, 2, 36, 40, 3)
+    squares = np.asarray(exact.coarser(16).compare(seen))
+    assert squares.shape == (2, 2, 3, 3, 3)
+    # The last row of squares has 4 rows of pixels, the last column 8 columns.
+    padded = np.pad(single, ((0, 0), (0, 0), (0, 12), (0, 8), (0, 0)))
+    expected = padded.reshape(2, 2, 3, 16, 3, 16, 3).sum(axis=(3, 5)) / 16
+    np.testing.assert_allclose(squares, expected, rtol=1e-4, atol=1e-4)
+    assert problem.coarser(16).outcome(
+        jnp.asarray(problem.space.start, jnp.zeros(()).dtype)
+    ).residual.shape == (2 * 2 * 3 * 3 * 3,)
+
+
+@float64
+def test_squares_lead_where_pixels_do_not():
+    """A body seen far from where it is: through squares a step ends much nearer."""
+    unknowns = parameters(
+        nu=Parameter(0.3, fixed=True),
+        E=Parameter(2e4, fixed=True),
+        v0=Parameter((-1.6, -0.2, -1.5), lower=-3, upper=3),
+    )
+    problem = pictured("rgb", 2, frames=4, unknowns=unknowns)
+    plain = fit(problem, trials=4, intervals=False)
+    led = fit(problem, stages=[Stage(coarser=12)], trials=4, intervals=False)
+    off = [np.max(np.abs(found.values["v0"] - TRUTH["v0"])) for found in (plain, led)]
+    assert off[1] < 0.1 * off[0]
 
 
 def test_pictures_are_checked():

@@ -56,9 +56,10 @@ def _velocity(start=(0.0, 0.0, -1.0)):
 
 
 def _pictured(name, truth, parameters, material_of, targets, **settings) -> Case:
-    """A body thrown at the floor, 14 frames at 24 per second, first v0 before the contact."""
+    """A body thrown at the floor, 14 frames at 24 per second; first v0 before the contact."""
     truth = {**truth, "v0": np.array(settings.pop("v0", (0.3, -0.2, -2.0)))}
-    settings = {"stages": (Stage(frames=1, free=("v0",)),), "views": 11} | settings
+    stages = (Stage(frames=1, free=("v0",), coarser=8), Stage(frames=6, coarser=8))
+    settings = {"stages": stages, "views": 11} | settings
     return Case(
         name=name,
         truth=truth,
@@ -175,7 +176,7 @@ def _heterogeneous() -> Case:
                 resolution,
                 counts=(half, len(x) - half),
             )
-            return scene, pgjax.initial_state(scene, x, (0.3, -0.2, -2.0))
+            return scene, pgjax.initial_state(scene, x, (0.3, 0.4, -1.0))
 
         return x, of
 
@@ -189,6 +190,7 @@ def _heterogeneous() -> Case:
         frames=14,
         frame_dt=1 / 24,
         targets={n: Target("log10", 1e-2, 5e-2) for n in ("E1", "E2")},
+        stages=(Stage(frames=6, coarser=8),),
         views=11,
         watched=((0.0, 0.0, 0.2), 1.7),
     )

@@ -149,7 +149,7 @@ def _stage(t: Table, keys: list[str], fit_frames: int) -> Stage:
     for key in free or ():
         if key not in keys:
             raise t.error("free", f"name unknowns ({', '.join(keys)}){nearest(key, keys)}")
-    return Stage(frames, free)
+    return Stage(frames, free, t.integer("coarser", 1))
 
 
 def fitted_content(case: CaseFile, values: dict[str, Any], dt: float) -> dict[str, Any]:

@@ -32,10 +32,13 @@ class Stage(NamedTuple):
         frames: last frame; all if None. A short horizon first keeps a fit out of local minima.
         free: names of the parameters; all that are free in the problem if None. Initial
             velocities, say, from the frames before a contact.
+        coarser: pictures are seen through squares of so many pixels. While a body is off by more
+            than what is drawn on it, single pixels lead nowhere.
     """
 
     frames: int | None = None
     free: tuple[str, ...] | None = None
+    coarser: int = 1
 
 
 @final
@@ -223,6 +226,8 @@ class _Run:
         for stage in stages:
             part = self.problem if stage.frames is None else self.problem.until(stage.frames)
             values = space.known(u)
+            if stage.coarser > 1:
+                part = part.coarser(stage.coarser)
             if stage.free is not None:
                 part = part.freeing(stage.free, values)
             own = part.space.vector({n: values[n] for n in part.space.free})

@@ -61,6 +61,10 @@ class Joint(AbstractProblem):
         """
         return self._with(self.space, tuple(p.until(min(frame, p.last)) for p in self.problems))
 
+    def coarser(self, pixels: int) -> "Joint":
+        """The problem in which pictures are seen through squares of so many pixels."""
+        return self._with(self.space, tuple(p.coarser(pixels) for p in self.problems))
+
     def with_space(self, space: Space) -> "Joint":
         """The same motions and data with other starts, or others of the parameters fixed."""
         return self._with(space, self.problems)

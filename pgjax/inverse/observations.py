@@ -86,6 +86,11 @@ class AbstractObservation(eqx.Module):
         chosen = np.flatnonzero(np.asarray(self.frames) <= frame)
         return self.part(chosen) if len(chosen) else None
 
+    def coarser(self, pixels: int) -> "AbstractObservation":
+        """Seen through squares of so many pixels; the same where there are no pixels."""
+        del pixels
+        return self
+
 
 @final
 class Positions(AbstractObservation):
@@ -225,6 +230,7 @@ class Pictures(AbstractObservation):
     sigma: Array
     weights: Array
     robust: Robust | None
+    square: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -259,6 +265,17 @@ class Pictures(AbstractObservation):
         self.sigma = _noise(sigma, self.data.shape, "the unit of a pixel")
         self.weights = frame_weights(weights, self.frames)
         self.robust = robust
+        self.square = 1
+
+    def coarser(self, pixels: int) -> "Pictures":
+        """Differences are averaged over squares of so many pixels.
+
+        Where a body is off by more than the size of what is drawn on it, pixels say little of
+        where it went; squares still do.
+        """
+        new = copy.copy(self)
+        object.__setattr__(new, "square", pixels)
+        return new
 
     def see(self, state: State) -> Array:
         """The pictures of one instant."""
@@ -284,10 +301,11 @@ class Pictures(AbstractObservation):
         data = self.data.astype(seen.dtype)
         off = _differences(seen, data, self.sigma)
         if self.channel != "depth":
-            return off
+            return _squares(off, self.square, 3 if self.channel == "rgb" else 2)
         # A difference in metres to nothing says nothing; leaving the silhouette must not pay.
         missed = jnp.where(jnp.isfinite(data) & ((seen > 0) != (data > 0)), 3, 0)
-        return jnp.where((seen > 0) & (data > 0), off, missed.astype(off.dtype))
+        off = jnp.where((seen > 0) & (data > 0), off, missed.astype(off.dtype))
+        return _squares(off, self.square, 2)
 
     def _check_data(self) -> None:
         size = (self.cameras.height, self.cameras.width)
@@ -338,6 +356,22 @@ def _differences(seen: Array, data: Array, sigma: Array) -> Array:
     data = data.astype(seen.dtype)
     known = jnp.isfinite(data)
     return jnp.where(known, seen - jnp.where(known, data, 0), 0) / sigma.astype(seen.dtype)
+
+
+def _squares(off: Array, side: int, last: int) -> Array:
+    """Differences averaged over squares of pixels, over the noise of the average.
+
+    The axes of the pixels are the first two of the `last` ones; at the edge squares are not full.
+    """
+    if side == 1:
+        return off
+    rows = off.ndim - last
+    room = [(0, -n % side if axis in (rows, rows + 1) else 0) for axis, n in enumerate(off.shape)]
+    padded = jnp.pad(off, room)
+    height, width = padded.shape[rows : rows + 2]
+    split = (height // side, side, width // side, side)
+    blocks = padded.reshape(*padded.shape[:rows], *split, *padded.shape[rows + 2 :])
+    return jnp.sum(blocks, axis=(rows + 1, rows + 3)) / side
 
 
 def _check_rank(name: str, value: Array, rank: int, axes: str) -> None:

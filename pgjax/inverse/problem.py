@@ -85,6 +85,10 @@ class AbstractProblem(eqx.Module):
         """
 
     @abc.abstractmethod
+    def coarser(self, pixels: int) -> "AbstractProblem":
+        """The problem in which pictures are seen through squares of so many pixels."""
+
+    @abc.abstractmethod
     def with_space(self, space: Space) -> "AbstractProblem":
         """The same motion and data with other starts, or others of the parameters fixed."""
 
@@ -190,6 +194,11 @@ class Problem(AbstractProblem):
                 f"is {frame}."
             )
         return self._with(self.space, tuple(kept), min(frame, self.frames))
+
+    def coarser(self, pixels: int) -> "Problem":
+        """The problem in which pictures are seen through squares of so many pixels."""
+        seen = tuple(o.coarser(pixels) for o in self.observations)
+        return self._with(self.space, seen, self.frames)
 
     def with_space(self, space: Space) -> "Problem":
         """The same motion and data with other starts, or others of the parameters fixed."""
