@@ -63,6 +63,8 @@ def measure(request):
     """`measure(case, quantity, value, below=… or above=… or within=(lo, hi))`: assert and keep.
 
     What a run measured is printed at its end as one table: value, demand, margin.
+    `measure.curve(case, panel, series, x, y, order=…)` keeps what is drawn: y over x (h/L), in the
+    panel of that title, beside a line of that order.
     """
 
     def check(case, quantity, value, *, below=None, above=None, within=None):
@@ -88,6 +90,18 @@ def measure(request):
         request.node.user_properties.append(("measured", row))
         assert ok, f"{case}, {quantity}: {value:.4g}, demanded {demand}"
 
+    def curve(case, panel, series, x, y, *, order=None):
+        kept = {
+            "case": case,
+            "panel": panel,
+            "series": series,
+            "x": [float(value) for value in x],
+            "y": [float(value) for value in y],
+            "order": order,
+        }
+        request.node.user_properties.append(("curve", kept))
+
+    check.curve = curve
     return check
 
 
@@ -98,19 +112,23 @@ def pytest_addoption(parser):
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    rows = [
-        row
-        for reports in terminalreporter.stats.values()
-        for report in reports
-        if getattr(report, "when", "") == "call"
-        for name, row in report.user_properties
-        if name == "measured"
-    ]
     path = config.getoption("--measured")
-    if not path or not rows:
+    kept = {
+        kind: [
+            value
+            for reports in terminalreporter.stats.values()
+            for report in reports
+            if getattr(report, "when", "") == "call"
+            for name, value in report.user_properties
+            if name == kind
+        ]
+        for kind in ("measured", "curve", "hard")
+    }
+    if not path or not any(kept.values()):
         return
+    rows = kept["measured"]
     rows.sort(key=lambda row: row["case"])
-    pathlib.Path(path).write_text(json.dumps(rows, indent=1) + "\n")
+    pathlib.Path(path).write_text(json.dumps(kept, indent=1) + "\n")
     terminalreporter.section("verification")
     for row in rows:
         terminalreporter.write_line(

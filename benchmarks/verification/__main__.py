@@ -12,6 +12,8 @@ import sys
 
 import jax
 
+from benchmarks.verification.plots import draw
+
 ROOT = pathlib.Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 COMMAND = "python -m benchmarks.verification"
@@ -29,14 +31,15 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def report(rows: list[dict], command: str) -> str:
-    """The table under what is needed to repeat it."""
+def report(rows: list[dict], command: str, picture: str | None) -> str:
+    """The table under what is needed to repeat it, and the curves if there are any."""
+    drawn = f"![Errors over the spacing of the grid]({picture}.png)\n\n" if picture else ""
     met = sum(row["ok"] for row in rows)
     return (
         "# Verification\n\n"
         f"{met} of {len(rows)} demands met. Written by `{command}` on {datetime.date.today()} with "
         f"JAX {jax.__version__}, Python {platform.python_version()}, {platform.machine()} "
-        f"{jax.default_backend()}.\n\n" + table(rows)
+        f"{jax.default_backend()}.\n\n" + drawn + table(rows)
     )
 
 
@@ -50,9 +53,12 @@ def main(arguments: list[str]) -> int:
     options = ["-m", "", "--measured", str(measured), *arguments]
     code = subprocess.call([sys.executable, "-m", "pytest", *cases, *options], cwd=ROOT)
     if measured.exists():
-        rows = json.loads(measured.read_text())
-        text = report(rows, " ".join([COMMAND, *arguments]))
+        kept = json.loads(measured.read_text())
+        rows, curves = kept["measured"], kept["curve"]
+        text = report(rows, " ".join([COMMAND, *arguments]), measured.stem if curves else None)
         measured.with_suffix(".md").write_text(text)
+        if curves:
+            draw(curves, measured.with_suffix(".png"))
         print(f"Wrote {measured.with_suffix('.md').relative_to(ROOT)}: {len(rows)} measurements.")
     return code
 

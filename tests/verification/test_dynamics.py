@@ -96,6 +96,7 @@ def test_v21_two_discs(measure, name):
         touch = t[np.argmax(kinetic < 1 - 1e-6)]
         early = (0.6 * 2**0.5 - 2 * RADIUS - touch * 0.08**0.5) * n
         measure("V21", f"gap at the first touch, cells, {case}", early, within=(0.0, 5.0))
+    measure.curve("V21", "discs: energy lost", name, [1 / n for n in lost], lost.values(), order=1)
     measure("V21", f"loss at n = 20 over that at 40, {name}", lost[20] / lost[40], above=1.7)
 
 

@@ -34,6 +34,8 @@ def test_v24_manufactured_solution(measure, d, name):
             continue
         errors[n] = manufactured.error(n, d, name)
         measure("V24", f"error, {name}, {d}-D, n = {n}", errors[n], below=1.25 * known)
+    h = [1 / n for n in errors]
+    measure.curve("V24", f"wave, {d}-D: error", name, h, errors.values(), order=2)
     rate = np.log2(errors[16] / errors[32])
     measure("V24", f"rate from n = 16 to 32, {name}, {d}-D", rate, above=1.85)
 
@@ -52,6 +54,7 @@ def test_v24_fails_without_the_affine_velocity(measure):
     coarse, fine = (
         manufactured.error(n, 1, "quadratic-grad", after=without_affine) for n in (16, 32)
     )
+    measure.curve("V24", "wave, 1-D: error", "PIC (control)", (1 / 16, 1 / 32), (coarse, fine))
     rate = np.log2(coarse / fine)
     measure("V24", "negative control: rate of PIC", rate, below=1.0)
     demand = 1.25 * WAVE_ERRORS[1, "quadratic-grad"][2]
@@ -121,6 +124,9 @@ def test_v27_free_bar(measure, name):
     results = {n: free_bar(n, name) for n in BARS[name]}
     period, loss = (np.array(values) for values in zip(*results.values(), strict=True))
     # A cubic spline is wider: its bar is longer by 0.44 h instead of 0.31 h.
+    h = [1 / n for n in results]
+    measure.curve("V27", "free bar: error of the period", name, h, period, order=1)
+    measure.curve("V27", "free bar: amplitude lost per period", name, h, loss, order=2)
     demands = (6e-3, 5e-4) if name.startswith("quadratic") else (7e-3, 1.25e-3)
     measure("V27", f"period error, {name}, n = 64", period[-1], within=(0.0, demands[0]))
     measure("V27", f"amplitude lost per period, {name}, n = 64", loss[-1], below=demands[1])

@@ -233,6 +233,7 @@ def test_v26_body_force():
 def test_v26_vortex(measure, name):
     """G = 0.1: a body with free surfaces that turns and shears."""
     coarse, fine = (vortex_error(n, name, 0.1) for n in (16, 32))
+    measure.curve("V26", "vortex: error", name, (1 / 16, 1 / 32), (coarse, fine), order=2)
     measure("V26", f"error, G = 0.1, h = 1/32, {name}", fine, below=3e-2)
     rate = np.log2(coarse / fine)
     measure("V26", f"rate from h = 1/16 to 1/32, G = 0.1, {name}", rate, above=1.8)
@@ -323,13 +324,15 @@ WHOLE = {"quadratic-grad": 0.07, "quadratic-mls": 0.07, "cubic-grad": 0.08, "cub
 
 @pytest.mark.parametrize("name", fast("quadratic-grad", "cubic-grad"))
 def test_v28_column_under_its_own_weight(measure, name):
-    whole = {}
+    whole, middle = {}, {}
     for n in (16, 32):
         Y, F, load = column(n, name)
         P = nominal_stress(pm.NeoHookean, F)
-        inside = column_error(Y, P, load, 3 / n)
+        inside = middle[n] = column_error(Y, P, load, 3 / n)
         whole[n] = column_error(Y, P, load)
         measure("V28", f"error 3 cells off the ends, n = {n}, {name}", inside, below=0.012)
+    for panel, errors in (("column: error off the ends", middle), ("column: error", whole)):
+        measure.curve("V28", panel, name, [1 / n for n in errors], errors.values(), order=0.5)
     measure("V28", f"error of the whole column, n = 16, {name}", whole[16], below=WHOLE[name])
     # Errors of the ends, in a part of the column that shrinks with h: √h.
     ratio = whole[16] / whole[32]
