@@ -30,10 +30,10 @@ def draw(curves: list[dict], path: Path) -> None:
 def _panel(axis: Any, title: str, curves: list[dict]) -> None:
     for curve in curves:
         axis.loglog(curve["x"], curve["y"], "o-", ms=3.5, lw=1.2, label=curve["series"])
-    orders = {curve["order"] for curve in curves} - {None}
-    x = np.array([min(min(c["x"]) for c in curves), max(max(c["x"]) for c in curves)])
-    top = max(max(c["y"]) for c in curves if c["order"] is not None)
-    for order in orders:
+    expected = [curve for curve in curves if curve["order"] is not None]
+    for order in {curve["order"] for curve in expected}:
+        x = np.array([min(min(c["x"]) for c in expected), max(max(c["x"]) for c in expected)])
+        top = max(max(c["y"]) for c in expected)
         axis.loglog(x, top * (x / x[1]) ** order, "k:", lw=1, label=f"order {order:g}")
     axis.set_title(title, fontsize=10)
     axis.set_xlabel("h/L")

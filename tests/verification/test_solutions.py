@@ -331,8 +331,9 @@ def test_v28_column_under_its_own_weight(measure, name):
         inside = middle[n] = column_error(Y, P, load, 3 / n)
         whole[n] = column_error(Y, P, load)
         measure("V28", f"error 3 cells off the ends, n = {n}, {name}", inside, below=0.012)
-    for panel, errors in (("column: error off the ends", middle), ("column: error", whole)):
-        measure.curve("V28", panel, name, [1 / n for n in errors], errors.values(), order=0.5)
+    h = [1 / n for n in whole]
+    measure.curve("V28", "column: error off the ends", name, h, middle.values())
+    measure.curve("V28", "column: error", name, h, whole.values(), order=0.5)
     measure("V28", f"error of the whole column, n = 16, {name}", whole[16], below=WHOLE[name])
     # Errors of the ends, in a part of the column that shrinks with h: √h.
     ratio = whole[16] / whole[32]
