@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
@@ -91,27 +93,31 @@ def problem(case: Case, tier: str, views: int | None = None) -> Problem:
 
 def _positions(case: Case, x: np.ndarray, build: Build, made_at: Resolution, _: int) -> Problem:
     index = _spread(len(x), case.seen)
-    data = _motion_of(case, made_at, x[index])
+    data, _ = _motion_of(case, made_at, x[index])
     observation = Positions(data[1:], particles=index, sigma=1e-3)
     return _problem(case, build, observation)
 
 
 def _pictures(case: Case, x: np.ndarray, build: Build, made_at: Resolution, views: int) -> Problem:
+    """The same Gaussians in both tiers: a capture looks as it looks, however it is simulated."""
     center, distance = case.watched
     ring = cameras(center, distance, case.views, case.pixels)[:views]
-    gaussians = painted(x, case.resolution.h / 2)
-    made_x, made_build = case.build(made_at)
     size = (case.frames, len(ring), case.pixels, case.pixels, 3)
-    blank = Pictures(
-        painted(made_x, made_at.h / 2), ring, np.zeros(size, np.float32), background=(0.2, 0.2, 0.2)
-    )
-    maker = _maker(case, made_build, blank, made_at)
-    (seen,), status = maker.see(_default(maker.space.start))
-    status.check()
-    observation = Pictures(
-        gaussians, ring, np.asarray(seen)[1:], background=(0.2, 0.2, 0.2), sigma=0.02
-    )
-    return _problem(case, build, observation)
+    gaussians = painted(x, case.resolution.h / 2)
+    sight = {"background": (0.2, 0.2, 0.2), "sigma": 0.02}
+    blank = Pictures(gaussians, ring, np.zeros(size, np.float32), **sight)
+    problem = _problem(case, build, blank)
+    _, state = build(problem.space.values(problem.space.start))
+    see = jax.jit(blank.see)
+    pictures = []
+    for places, F in zip(*_motion_of(case, made_at, x), strict=True):
+        at = jnp.asarray(places, state.dtype) - jnp.broadcast_to(state.origin, state.v.shape)
+        H = jnp.asarray(F - np.eye(3), state.dtype)
+        now = eqx.tree_at(lambda s: (s.position, s.He), state, (at, H))
+        if state.H is not None:
+            now = eqx.tree_at(lambda s: s.H, now, H)
+        pictures.append(np.asarray(see(now)))
+    return problem.observing(Pictures(gaussians, ring, np.stack(pictures[1:]), **sight))
 
 
 def _problem(case: Case, build: Build, observation) -> Problem:
@@ -140,8 +146,10 @@ def _maker(case: Case, build: Build, observation, made_at: Resolution) -> Proble
     )
 
 
-def _motion_of(case: Case, made_at: Resolution, points: np.ndarray) -> np.ndarray:
-    """Positions of material points in every frame, from a simulation at the true values."""
+def _motion_of(
+    case: Case, made_at: Resolution, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and F of material points in every frame, from a simulation at the true values."""
     x, build = case.build(made_at)
     blank = Positions(np.zeros((case.frames, len(x), x.shape[1])))
     maker = _maker(case, build, blank, made_at)
@@ -154,20 +162,22 @@ def _motion_of(case: Case, made_at: Resolution, points: np.ndarray) -> np.ndarra
         substeps=maker.substeps,
         allow_unstable=True,
     )
-    moved = np.asarray(trajectory.saved.x)
+    moved, F = np.asarray(trajectory.saved.x), np.asarray(trajectory.saved.F)
     distance, near = cKDTree(x).query(points)
     if np.max(distance) < 1e-9:
-        return moved[:, near]
-    # Between particles the motion is that of the four nearest ones, weighted by distance.
+        return moved[:, near], F[:, near]
+    # Between particles the motion is that of the four nearest ones, weighted by distance, each
+    # carrying the point along with its own F.
     distance, near = cKDTree(x).query(points, k=4)
     weights = 1 / (distance + 1e-9)
     weights /= weights.sum(axis=1, keepdims=True)
-    offset = points - np.einsum("pk,pkd->pd", weights, x[near])
-    return np.einsum("pk,fpkd->fpd", weights, moved[:, near]) + offset[None]
-
-
-def _default(u: np.ndarray):
-    return jnp.asarray(u, jnp.zeros(()).dtype)
+    d = x.shape[1]
+    arms = points[:, None] - x[near]
+    carried = moved[:, near] + np.einsum("fpkij,pkj->fpki", F[:, near][..., :d, :d], arms)
+    return (
+        np.einsum("pk,fpkd->fpd", weights, carried),
+        np.einsum("pk,fpkij->fpij", weights, F[:, near]),
+    )
 
 
 def _spread(count: int, wanted: int | None) -> np.ndarray:

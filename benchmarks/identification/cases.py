@@ -315,13 +315,18 @@ class Bands(AbstractGridCondition):
         """Coulomb friction of the band the node is in."""
         del t
         count = self.friction.shape[0]
-        band = jnp.clip(jnp.floor(x[0] / self.width).astype(int), 0, count - 1)
+        # Nodes lie on the edges of the bands: rounding must not decide.
+        band = jnp.clip(jnp.floor(x[0] / self.width + 1e-6).astype(int), 0, count - 1)
         held = Separating(self.friction[band])(v, jnp.asarray([0.0, 1.0], v.dtype))
         return jnp.where(x[1] <= 1e-6, held, v)
 
 
 def _dam_break(seen: int) -> Case:
-    """A column of water runs over five bands of a floor in two dimensions; the first is smooth."""
+    """A column of water runs over five bands of a floor in two dimensions; the first is smooth.
+
+    The stages follow the front from band to band.
+    """
+    bands = ("friction2", "friction3", "friction4", "friction5")
 
     def build(resolution: Resolution):
         x, volumes = sampling.block((0.0, 0.0), (1.0, 0.6), resolution.h / 2)
@@ -330,7 +335,7 @@ def _dam_break(seen: int) -> Case:
         walls = Box((0.0, -1.0), (5.0, 9.0), Separating(0.0))
 
         def of(values):
-            friction = jnp.concatenate([jnp.zeros_like(values["friction"][:1]), values["friction"]])
+            friction = jnp.stack([jnp.zeros_like(values[bands[0]]), *(values[b] for b in bands)])
             scene = pgjax.Scene(
                 grid,
                 Material(models.Fluid(2e5, 1e-3)),
@@ -346,14 +351,14 @@ def _dam_break(seen: int) -> Case:
 
     return Case(
         name=f"dam break, {seen} particles seen",
-        truth={"friction": np.array([0.5, 0.1, 0.2, 0.0])},
-        parameters={"friction": Parameter((0.25, 0.25, 0.25, 0.25), lower=0.0, upper=1.0)},
+        truth=dict(zip(bands, (0.5, 0.1, 0.2, 0.0), strict=True)),
+        parameters={band: Parameter(0.25, lower=0.0, upper=1.0) for band in bands},
         build=build,
         resolution=Resolution(25),
         frames=30,
         frame_dt=0.04,
-        targets={"friction": Target("absolute", 5e-3, 2e-2)},
-        stages=(Stage(frames=20),),
+        targets={band: Target("absolute", 5e-3, 2e-2) for band in bands},
+        stages=tuple(Stage(frames=7 + 5 * k, free=(band,)) for k, band in enumerate(bands)),
         seen=seen,
         double=True,
         trials=15,

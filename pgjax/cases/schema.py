@@ -39,6 +39,7 @@ class CaseFile:
         fit_frames: last frame that is fitted.
         frames: last frame that is predicted and compared.
         channel: "rgb" or "silhouette".
+        coarser: pictures are compared through squares of so many pixels.
         noise: standard deviation of a pixel, or of a position in m.
         views: tables with pictures, and the camera of each; the scene's if None.
         track: table of a track; None if there is none.
@@ -55,6 +56,7 @@ class CaseFile:
     fit_frames: int
     frames: int
     channel: str
+    coarser: int
     noise: float
     views: tuple[tuple[Table, CameraPart | None], ...]
     track: Table | None
@@ -100,6 +102,7 @@ def _case(t: Table, path: Path, data: Path | None) -> CaseFile:
         fit_frames=fit_frames,
         frames=frames,
         channel=channel,
+        coarser=t.integer("coarser", 1),
         noise=t.number("noise", 0.05 if track is None else 1e-3, above=0),
         views=views,
         track=track,

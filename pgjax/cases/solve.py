@@ -92,7 +92,8 @@ def prepare(case: CaseFile) -> Prepared:
     # The keys stand in the scene file as they are written.
     fitted_content(case, {u.key: u.parameter.start for u in case.unknowns}, whole.dt)
     notes = [str(w.message) for w in caught] + _first_look(case, whole, films)
-    return Prepared(case, made, whole.until(case.fit_frames), whole, films, tuple(notes))
+    problem = whole.until(case.fit_frames).coarser(case.coarser)
+    return Prepared(case, made, problem, whole, films, tuple(notes))
 
 
 def _camera(case: CaseFile, made: Plan, part: CameraPart, label: str) -> Camera:
