@@ -5,10 +5,12 @@ Further arguments go to pytest, e.g. `python -m benchmarks.verification -k V24 -
 
 import datetime
 import json
+import os
 import pathlib
 import platform
 import subprocess
 import sys
+import tempfile
 
 import jax
 
@@ -31,6 +33,22 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def matrix(hard: list[dict]) -> str:
+    """What held in the hard cases, by case, material and precision, as a Markdown table."""
+    precisions = sorted({row["precision"] for row in hard})
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for row in hard:
+        found.setdefault((row["case"], row["material"]), {})[row["precision"]] = row["outcome"]
+    lines = [
+        "| case | material | " + " | ".join(precisions) + " |",
+        "|---|---|" + "---|" * len(precisions),
+    ]
+    for (case, material), outcomes in sorted(found.items()):
+        cells = " | ".join(outcomes.get(p, "") for p in precisions)
+        lines.append(f"| {case} | {material} | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
 def report(rows: list[dict], command: str, picture: str | None) -> str:
     """The table under what is needed to repeat it, and the curves if there are any."""
     drawn = f"![Errors over the spacing of the grid]({picture}.png)\n\n" if picture else ""
@@ -43,24 +61,55 @@ def report(rows: list[dict], command: str, picture: str | None) -> str:
     )
 
 
-def main(arguments: list[str]) -> int:
-    """Run pytest, slow cases included, and write the results beside each other."""
-    RESULTS.mkdir(exist_ok=True)
-    measured = RESULTS / "verification_core.json"
-    measured.unlink(missing_ok=True)
+def pytest(cases: list[str], arguments: list[str], *, float32: bool = False) -> tuple[int, dict]:
+    """Run tests, slow ones included: the exit status, and what they kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        kept = pathlib.Path(folder) / "kept.json"
+        options = ["-m", "", "--measured", str(kept), *arguments]
+        env = {**os.environ, "PGJAX_TEST_FLOAT32": str(int(float32))}
+        command = [sys.executable, "-m", "pytest", *cases, *options]
+        code = subprocess.call(command, cwd=ROOT, env=env)
+        return code, json.loads(kept.read_text()) if kept.exists() else {}
+
+
+def verify(arguments: list[str]) -> int:
+    """The verification cases: `verification_core.json`, `.md` and `.png`."""
     others = ("timestep", "oracle_step", "linalg", "rollout")
     cases = ["tests/verification", *(f"tests/test_{name}.py" for name in others)]
-    options = ["-m", "", "--measured", str(measured), *arguments]
-    code = subprocess.call([sys.executable, "-m", "pytest", *cases, *options], cwd=ROOT)
-    if measured.exists():
-        kept = json.loads(measured.read_text())
-        rows, curves = kept["measured"], kept["curve"]
-        text = report(rows, " ".join([COMMAND, *arguments]), measured.stem if curves else None)
-        measured.with_suffix(".md").write_text(text)
+    code, kept = pytest(cases, arguments)
+    rows, curves = kept.get("measured", []), kept.get("curve", [])
+    if rows:
+        path = RESULTS / "verification_core.json"
+        path.write_text(json.dumps({"measured": rows, "curve": curves}, indent=1) + "\n")
+        text = report(rows, " ".join([COMMAND, *arguments]), path.stem if curves else None)
+        path.with_suffix(".md").write_text(text)
         if curves:
-            draw(curves, measured.with_suffix(".png"))
-        print(f"Wrote {measured.with_suffix('.md').relative_to(ROOT)}: {len(rows)} measurements.")
+            draw(curves, path.with_suffix(".png"))
+        print(f"Wrote {path.with_suffix('.md').relative_to(ROOT)}: {len(rows)} measurements.")
     return code
+
+
+def verify_hard_cases(arguments: list[str]) -> int:
+    """The hard cases in both precisions: `verification_hard.json` and `.md`."""
+    codes, rows = [], []
+    for float32 in (False, True):
+        code, kept = pytest(["tests/hard"], arguments, float32=float32)
+        codes.append(code)
+        rows += kept.get("hard", [])
+    if rows:
+        path = RESULTS / "verification_hard.json"
+        path.write_text(json.dumps(rows, indent=1) + "\n")
+        command = " ".join([COMMAND, *arguments])
+        about = f"# Hard cases\n\nWritten by `{command}` on {datetime.date.today()}.\n\n"
+        path.with_suffix(".md").write_text(about + matrix(rows))
+        print(f"Wrote {path.with_suffix('.md').relative_to(ROOT)}: {len(rows)} outcomes.")
+    return max(codes)
+
+
+def main(arguments: list[str]) -> int:
+    """Both, and what they measured beside each other."""
+    RESULTS.mkdir(exist_ok=True)
+    return max(verify(arguments), verify_hard_cases(arguments))
 
 
 if __name__ == "__main__":
