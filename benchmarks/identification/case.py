@@ -108,7 +108,7 @@ def _pictures(case: Case, x: np.ndarray, build: Build, made_at: Resolution, view
     blank = Pictures(gaussians, ring, np.zeros(size, np.float32), **sight)
     problem = _problem(case, build, blank)
     _, state = build(problem.space.values(problem.space.start))
-    see = jax.jit(blank.see)
+    see = jax.jit(lambda state: blank.see(state))
     pictures = []
     for places, F in zip(*_motion_of(case, made_at, x), strict=True):
         at = jnp.asarray(places, state.dtype) - jnp.broadcast_to(state.origin, state.v.shape)
