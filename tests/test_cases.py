@@ -84,6 +84,7 @@ unit = "m/s"
 [solver]
 trials = 8
 tolerance = 1e-3
+stage = [{{ frames = 2, free = ["model.velocity"], coarser = 4 }}]
 
 {data}
 """
@@ -135,6 +136,9 @@ def test_fit_from_pictures(recorded, tmp_path, capsys):
     assert "| `material.E` |" in report
     sheet = imageio.imread(out / "view-1.png")
     assert sheet.shape == (3 * 50, 6 * 50, 3)
+    course = imageio.imread(out / "convergence.png")
+    # Something is drawn.
+    assert np.mean(course[..., :3].min(axis=-1) < 250) > 0.02
     fitted = tomllib.loads((out / "fitted.toml").read_text())
     assert fitted["time"]["dt"] == prepare(read_case(case)).problem.dt
     np.testing.assert_allclose(np.log10(fitted["material"][0]["E"] / 2e4), 0, atol=0.03)

@@ -154,6 +154,8 @@ def test_pictures_are_checked():
         Pictures(painted(x), cameras(1)[0], np.zeros((2, 36, 40)))
     with pytest.raises(ValueError, match="`channel` must be"):
         Pictures(painted(x), cameras(1)[0], np.zeros((2, 36, 40)), channel="colour")
+    with pytest.raises(ValueError, match="`pixels` must be a whole number ≥ 1, but is 0"):
+        Pictures(painted(x), cameras(1)[0], np.zeros((2, 36, 40, 3))).coarser(0)
     with pytest.raises(ValueError, match="`frames` must ascend"):
         Positions(np.zeros((2, 5, 3)), frames=[3, 1])
     with pytest.raises(ValueError, match="`particles` must name 5"):

@@ -11,6 +11,7 @@ import pytest
 from scene_files import CAMERA, DROP, GRID, JELLY, MODEL, changed, planned, write
 
 from pgjax import cli
+from pgjax.cases import read_case
 from pgjax.render import Gaussians, load_ply, save_ply
 from pgjax.result import SimulationError
 from pgjax.scenes import SceneError, plan, presets, read_scene, resolve
@@ -226,3 +227,9 @@ def test_zero_frames_is_an_error(capsys):
 @pytest.mark.parametrize("path", sorted(pathlib.Path("examples").glob("*.toml")), ids=str)
 def test_examples_are_valid(path):
     assert read_scene(path).materials
+
+
+@pytest.mark.parametrize("path", sorted(pathlib.Path("examples/fit").glob("*.toml")), ids=str)
+def test_example_cases_are_valid(path, tmp_path):
+    (tmp_path / "frames").mkdir()
+    assert read_case(path, tmp_path / "frames").unknowns

@@ -226,7 +226,7 @@ class _Run:
         for stage in stages:
             part = self.problem if stage.frames is None else self.problem.until(stage.frames)
             values = space.known(u)
-            if stage.coarser > 1:
+            if stage.coarser != 1:
                 part = part.coarser(stage.coarser)
             if stage.free is not None:
                 part = part.freeing(stage.free, values)

@@ -273,6 +273,8 @@ class Pictures(AbstractObservation):
         Where a body is off by more than the size of what is drawn on it, pixels say little of
         where it went; squares still do.
         """
+        if not isinstance(pixels, int) or pixels < 1:
+            raise ValueError(f"Argument `pixels` must be a whole number ≥ 1, but is {pixels!r}.")
         new = copy.copy(self)
         object.__setattr__(new, "square", pixels)
         return new
