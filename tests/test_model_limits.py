@@ -378,3 +378,17 @@ def test_tangent_bound_is_above_the_largest_eigenvalue_and_sharp_at_rest(name):
             assert np.median(ratio) > 0.5
             assert abs(float(bound[0] / max(d * law.lam + 2 * law.mu, 2 * law.mu)) - 1) < 1e-14
             assert abs(ratio[0] - 1) < 1e-12
+
+
+@pytest.mark.float64
+@pytest.mark.parametrize("viscosity", [0.0, 10.0, np.inf])
+@pytest.mark.parametrize("stretch", [1.001, 3.0, 10.0, 30.0, 100.0, 1e-2, 1 / 30])
+def test_herschel_bulkley_keeps_the_volume_of_long_and_flat_states(stretch, viscosity):
+    """A single long axis gives `det(S + c I) = 1` two roots that nearly coincide."""
+    law, flow = pm.DevVolNeoHookean(1e4, 0.3), pm.HerschelBulkley(50.0, viscosity)
+    turn, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))
+    F = turn @ np.diag([stretch, 1.0, 1.0]) @ turn.T
+    for dt in (1e-5, 1e-3):
+        mapped, _ = flow.return_map(jnp.asarray(F - np.eye(3)), None, law, jnp.asarray(dt))
+        J = np.linalg.det(np.asarray(mapped) + np.eye(3))
+        np.testing.assert_allclose(J, stretch, rtol=1e-7)

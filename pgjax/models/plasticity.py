@@ -324,7 +324,8 @@ class HerschelBulkley(AbstractPlasticity):
     `s = s_tr − (s_tr − s_Y)/(1 + η/(2 μ Δt))`, other h the root of
     `η^(1/h) (s_tr − s) = 2 μ Δt (s − s_Y)^(1/h)`. Volume is kept exactly: det b̄ = 1.
     Steady shear at h = 1: `τ = σ_Y/√3 + (η/2) γ̇`. Where the stretches of a trial state differ by
-    a factor of 1e6 (in single precision 30) `det b̄ = 1` is lost to rounding.
+    a factor of 1e3 (in single precision 10) `det b̄ = 1` holds to 1e-6 (1e-4); beyond, it is lost
+    to rounding.
 
     Args:
         yield_stress: σ_Y, Pa, uniaxial: yields at `‖dev τ‖ = √(2/3) σ_Y`. Not comparable with
@@ -374,12 +375,12 @@ class HerschelBulkley(AbstractPlasticity):
         yields = (s_trial > _ROOT_2_3 * self.yield_stress) & (volume_change(H) > -1)
         s = jnp.where(yields, self.flow_stress(s_trial, mu, dt), s_trial)
         S = (s / mu) * safe_divide(trial, norm * jnp.ones_like(trial))
-        c = _unit_determinant(S)
+        _, _, Q = principal_stretches(H)
+        c = _unit_determinant(S, Q)
         # b̄_new b̄_trial⁻¹ − I, with b̄⁻¹ = cof b̄ since det b̄ = 1; coaxial, so symmetric.
         change = (S + c * identity(S)) - strain
         Y = change @ cofactor(strain + identity(S))
         Y = jnp.where(yields, (Y + Y.T) / 2, 0)
-        _, _, Q = principal_stretches(H)
         M = _sqrt_map(Y, Q)
         return jnp.where(yields, H + M + M @ H, H), history
 
@@ -391,26 +392,43 @@ def _sqrt_map(Y: Matrix3, Q: Matrix3) -> Matrix3:
     return spectral_map(Y, Q, y / (1 + root), 1 / (root[:, None] + root[None, :]))
 
 
-def _unit_determinant(S: Matrix3) -> Scalar:
-    """`c − 1` such that `det(S + c I) = 1` for a symmetric deviator S.
+def _unit_determinant(S: Matrix3, Q: Matrix3) -> Scalar:
+    """`c − 1` such that `det(S + c I) = 1` for a symmetric deviator S with eigenvectors Q.
 
-    The largest root of `c³ − ½‖S‖² c + det S − 1 = 0`, by Newton from above, where the cubic is
-    convex and increasing; written for e = c − 1 it is accurate for small S. The last step is
-    differentiated, which is the implicit function theorem.
+    The largest root of `f(c) = c³ − a c + q − 1`, `a = ½‖S‖²`, `q = det S`. It lies above the
+    minimum of f at `m = √(a/3)`, by the root of `δ³ + 3 m δ² = −f(m) = 1 + 2 m³ − q`, whose right
+    side is at least 1. A last Newton step in e = c − 1 makes it accurate for small S, where c is
+    near 1, and carries the derivative, which is the implicit function theorem; for large S its
+    value would be rounding.
     """
     a = jnp.sum(S * S) / 2
     q = jnp.sum(S[0] * cofactor(S)[0])
+    fa = jax.lax.stop_gradient(a)
+    m = jnp.sqrt(fa / 3)
+    depth = 1 + jax.lax.stop_gradient(_excess_of_cubes(S, Q, m, q))
 
-    def newton(e: Scalar, a: Scalar, q: Scalar) -> Scalar:
-        value = e * (e * (e + 3) + 3 - a) - a + q
-        return e - value / (3 * (1 + e) ** 2 - a)
+    def newton(_: Array, delta: Scalar) -> Scalar:
+        value = delta**2 * (delta + 3 * m) - depth
+        return delta - value / (3 * delta * (delta + 2 * m))
 
-    fa, fq = jax.lax.stop_gradient((a, q))
-    start = jnp.sqrt(fa) + jnp.cbrt(jnp.abs(1 - fq)) - 1
-    start = jnp.maximum(start, 0)
-    root = jax.lax.fori_loop(0, 12, lambda _, e: newton(e, fa, fq), start)
-    slope = 3 * (1 + root) ** 2 - fa
-    return root - ((root * (root * (root + 3) + 3 - a) - a + q) / slope)
+    # Both are upper bounds, and one of them is near.
+    start = jnp.minimum(jnp.cbrt(depth), jnp.sqrt(depth / jnp.maximum(3 * m, 1e-30)))
+    c = m + jax.lax.fori_loop(0, 8, newton, start)
+    e = c - 1
+    value = e * (e * (e + 3) + 3 - a) - a + q
+    value = jnp.where(m < 1, value, value - jax.lax.stop_gradient(value))
+    return e - value / (3 * c**2 - fa)
+
+
+def _excess_of_cubes(S: Matrix3, Q: Matrix3, m: Scalar, q: Scalar) -> Scalar:
+    """`2 m³ − det S ≥ 0` without cancellation where two eigenvalues of S are nearly equal.
+
+    `(2 m³ − q)(2 m³ + q)` is the product of the squared differences of eigenvalues over 27.
+    """
+    x, y, z = (jnp.dot(Q[:, i], S @ Q[:, i]) for i in range(3))
+    product = ((x - y) * (y - z) * (z - x)) ** 2 / 27
+    total = 2 * m**3 + q
+    return jnp.where(q > 0, product / jnp.where(q > 0, total, 1), 2 * m**3 - q)
 
 
 def _herschel_bulkley_excess(
