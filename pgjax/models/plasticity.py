@@ -413,11 +413,12 @@ def _unit_determinant(S: Matrix3, Q: Matrix3) -> Scalar:
 
     # Both are upper bounds, and one of them is near.
     start = jnp.minimum(jnp.cbrt(depth), jnp.sqrt(depth / jnp.maximum(3 * m, 1e-30)))
-    c = m + jax.lax.fori_loop(0, 8, newton, start)
-    e = c - 1
+    delta = jax.lax.fori_loop(0, 8, newton, start)
+    e = m + delta - 1
     value = e * (e * (e + 3) + 3 - a) - a + q
     value = jnp.where(m < 1, value, value - jax.lax.stop_gradient(value))
-    return e - value / (3 * c**2 - fa)
+    # f'(c) = 3 c² − a, positive as it is written here.
+    return e - value / (3 * delta * (delta + 2 * m))
 
 
 def _excess_of_cubes(S: Matrix3, Q: Matrix3, m: Scalar, q: Scalar) -> Scalar:

@@ -1,0 +1,1 @@
+"""Hard cases: what must not break, whatever the material."""
