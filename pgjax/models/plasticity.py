@@ -15,9 +15,19 @@ import jax
 import jax.numpy as jnp
 
 from pgjax._safe import frobenius, safe_divide
-from pgjax._types import Array, Matrix3, Scalar, as_float_array, nonnegative, parameter, require
+from pgjax._types import (
+    Array,
+    Matrix3,
+    Scalar,
+    Vector3,
+    as_float_array,
+    nonnegative,
+    parameter,
+    require,
+)
 from pgjax.linalg import cofactor, deviator, spectral_map, volume_change
 from pgjax.models.elasticity import (
+    SMALLEST_VOLUME_RATIO,
     AbstractElasticity,
     DevVolNeoHookean,
     StVKHencky,
@@ -324,8 +334,8 @@ class HerschelBulkley(AbstractPlasticity):
     `s = s_tr − (s_tr − s_Y)/(1 + η/(2 μ Δt))`, other h the root of
     `η^(1/h) (s_tr − s) = 2 μ Δt (s − s_Y)^(1/h)`. Volume is kept exactly: det b̄ = 1.
     Steady shear at h = 1: `τ = σ_Y/√3 + (η/2) γ̇`. Where the stretches of a trial state differ by
-    a factor of 1e3 (in single precision 10) `det b̄ = 1` holds to 1e-6 (1e-4); beyond, it is lost
-    to rounding.
+    a factor of 1e4 (in single precision 100) `det b̄ = 1` holds to 1e-8 (1e-3); far beyond, it and
+    the derivatives are lost to rounding.
 
     Args:
         yield_stress: σ_Y, Pa, uniaxial: yields at `‖dev τ‖ = √(2/3) σ_Y`. Not comparable with
@@ -375,19 +385,37 @@ class HerschelBulkley(AbstractPlasticity):
         yields = (s_trial > _ROOT_2_3 * self.yield_stress) & (volume_change(H) > -1)
         s = jnp.where(yields, self.flow_stress(s_trial, mu, dt), s_trial)
         S = (s / mu) * safe_divide(trial, norm * jnp.ones_like(trial))
-        _, _, Q = principal_stretches(H)
+        sigma, _, Q = principal_stretches(H)
         c = _unit_determinant(S, Q)
         # b̄_new b̄_trial⁻¹ − I, with b̄⁻¹ = cof b̄ since det b̄ = 1; coaxial, so symmetric.
         change = (S + c * identity(S)) - strain
         Y = change @ cofactor(strain + identity(S))
         Y = jnp.where(yields, (Y + Y.T) / 2, 0)
-        M = _sqrt_map(Y, Q)
+        y = jnp.where(yields, _principal_change(S, c, strain, sigma, Q), 0)
+        M = _sqrt_map(Y, Q, y)
         return jnp.where(yields, H + M + M @ H, H), history
 
 
-def _sqrt_map(Y: Matrix3, Q: Matrix3) -> Matrix3:
-    """`√(I + Y) − I` of a symmetric Y > −I whose eigenvectors are the columns of Q."""
-    y = jax.lax.stop_gradient(jnp.diagonal(Q.T @ Y @ Q))
+def _principal_change(
+    S: Matrix3, e: Scalar, strain: Matrix3, sigma: Vector3, Q: Matrix3
+) -> Vector3:
+    """Eigenvalues of `b̄_new b̄⁻¹ − I` for `b̄_new − I = S + e I` and `strain = b̄ − I`; no derivative.
+
+    Where the stretches differ much, the smallest eigenvalue of b̄ is lost in its matrix, but not in
+    the stretches; where the law is continued, `strain` is not that of the volume there is.
+    """
+    S, e, strain = jax.lax.stop_gradient((S, e, strain))
+    new, old = (jnp.diagonal(Q.T @ A @ Q) for A in (S, strain))
+    new = new + e
+    J = jnp.maximum(sigma[0] * sigma[1] * sigma[2], jnp.finfo(S.dtype).tiny)
+    wide = (sigma[0] > 2 * sigma[2]) | (J < 2 * SMALLEST_VOLUME_RATIO)
+    # At least 1e-12: a stretch of nothing has no direction to be restored to.
+    exact = jnp.where(wide, jnp.maximum(sigma**2 * J ** (-2 / 3), 1e-12), 1)
+    return jnp.where(wide, (1 + new) / exact - 1, (new - old) / jnp.where(wide, 1, 1 + old))
+
+
+def _sqrt_map(Y: Matrix3, Q: Matrix3, y: Vector3) -> Matrix3:
+    """`√(I + Y) − I` of a symmetric Y > −I with eigenvalues y and eigenvectors Q."""
     root = jnp.sqrt(jnp.maximum(1 + y, 1e-12))
     return spectral_map(Y, Q, y / (1 + root), 1 / (root[:, None] + root[None, :]))
 

@@ -121,8 +121,7 @@ def test_h07_stretched_a_thousandfold(name, holds):
     scene, end, dt = survives(name, F)
     start = deformed(name, F)[1]
     assert dt < pgjax.stable_dt(scene) / 4
-    if name != "paste":
-        assert energies(scene, end)[0] < 1.01 * energies(scene, start)[1]
+    assert energies(scene, end)[0] < 1.01 * energies(scene, start)[1]
     holds("H07", material=name, outcome=conditions(end))
 
 
@@ -138,7 +137,7 @@ def test_h08_crushed(name, least, holds):
 
 @every_material
 def test_h09_condition_of_a_million(name, holds):
-    """In single precision the return mapping of paste has lost det b̄ = 1 by then, as it says."""
+    """In single precision derivatives of the return mapping of paste are lost by then."""
     lost = name == "paste" and jnp.zeros(()).dtype == jnp.float32
     _, end, _ = survives(name, np.diag([1e3, 1e-3, 1.0]), smooth=not lost)
     holds("H09", material=name, outcome=conditions(end))
