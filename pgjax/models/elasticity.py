@@ -36,7 +36,8 @@ def left_strain(H: Matrix3) -> Matrix3:
 def log_volume(H: Matrix3) -> tuple[Scalar, Scalar]:
     """`log J` and `J`, continued by its tangent below `J = 1e-2`.
 
-    The continuation keeps growing as a particle inverts, so the pressure pushes it back.
+    The continuation keeps growing, so the pressure resists being crushed further. What is inverted
+    stays so, and is counted: a stable step multiplies F by a matrix of positive determinant.
     """
     change = volume_change(H)
     J = 1 + change

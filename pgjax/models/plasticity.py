@@ -381,7 +381,7 @@ class HerschelBulkley(AbstractPlasticity):
         trial = deviator(strain)
         norm = frobenius(trial)
         s_trial = mu * norm
-        # An inverted particle does not flow: its stress has to push it back first.
+        # An inverted particle does not flow: its stress means nothing, and it is counted.
         yields = (s_trial > _ROOT_2_3 * self.yield_stress) & (volume_change(H) > -1)
         s = jnp.where(yields, self.flow_stress(s_trial, mu, dt), s_trial)
         S = (s / mu) * safe_divide(trial, norm * jnp.ones_like(trial))

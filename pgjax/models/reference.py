@@ -127,7 +127,7 @@ class StVKHenckySVD(AbstractElasticity):
 class AbstractPrincipalPlasticity(AbstractPlasticity):
     """A return mapping `U Z(Σ) Vᵀ`: a new one implements `principal` only.
 
-    An inverted particle (det F ≤ 0) does not flow: its stress has to push it back first.
+    An inverted particle (det F ≤ 0) does not flow.
     """
 
     @abc.abstractmethod

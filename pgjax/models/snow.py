@@ -84,8 +84,7 @@ class CriticalStretches(AbstractPlasticity):
     """Elastic stretches kept in `[1 − θ_c, 1 + θ_s]` (Stomakhin et al. 2013); goes with `Snow`.
 
     `Fe = U clamp(Σ) Vᵀ`, `J_p ← J_p det(Fe_trial)/det(Fe)`, so that `F = Fe F_p`. An inverted
-    particle (det F ≤ 0) does not flow: its stress has to push it back first. A stretch below 1e-4
-    counts as 1e-4. Hardening makes this
+    particle (det F ≤ 0) does not flow. A stretch below 1e-4 counts as 1e-4. Hardening makes this
     flow store energy where snow is packed; it dissipates at ξ = 0.
 
     Args:
