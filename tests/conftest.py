@@ -84,7 +84,7 @@ def measure(request):
             "quantity": quantity,
             "value": value,
             "demand": demand,
-            "margin": margin,
+            "margin": float(margin),
             "ok": bool(ok),
         }
         request.node.user_properties.append(("measured", row))
