@@ -111,7 +111,7 @@ def simulate(
             once more), and so runs forward once less.
         ledger: keep accounts of mass, momenta and energies, and of what walls, forces and plastic
             flow put in and take out: `trajectory.ledger`. The motion is the same; a step costs
-            about twice as much.
+            about 1.5 times as much.
 
     Raises:
         ValueError: an argument is out of range, or dt is above the stable bound at rest.
