@@ -8,6 +8,8 @@ from pgjax.inverse.descent import descend_problem as descend_problem
 from pgjax.inverse.fitting import Fit as Fit
 from pgjax.inverse.fitting import Stage as Stage
 from pgjax.inverse.fitting import fit as fit
+from pgjax.inverse.growth import Growth as Growth
+from pgjax.inverse.growth import growth as growth
 from pgjax.inverse.information import Profile as Profile
 from pgjax.inverse.information import information as information
 from pgjax.inverse.information import profile as profile

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
+from pgjax.inverse.growth import magnified
 from pgjax.inverse.levenberg import (
     Descent,
     FitError,
@@ -56,7 +57,8 @@ class Fit:
         converged: whether the last stage ended because nothing was left to gain.
         reason: why it ended.
         uncertainty: covariance and intervals; None if it was not asked for.
-        messages: what a reader has to know: bounds that were met, what is not identifiable.
+        messages: what a reader has to know: bounds that were met, what is not identifiable, a
+            motion that magnifies changes by more than 1e6.
         simulations: number of forward runs, a tangent counted as one.
         seconds: wall time, compiling included.
     """
@@ -276,6 +278,7 @@ def _messages(
                     f"{name} ended on its {side} bound: the data ask for a value beyond it."
                 )
     messages += best.best.status.messages()
+    messages += magnified(problem, best.best)
     rivals = [end for end in others if end.best.cost <= 1.05 * best.best.cost]
     far = [e for e in rivals if np.abs(e.best.u - best.best.u).max() > 0.05]
     if far:
