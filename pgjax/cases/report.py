@@ -92,15 +92,19 @@ def _uncertainty(found: Fit) -> list[str]:
     lines = [
         "## How sure",
         "",
-        f"The residual is {u.noise:.3g} times the noise that was given. Intervals follow from it; "
-        "they do not know of errors of the model.",
+        f"The residual is {u.noise:.3g} times the noise that was given. Intervals follow from it, "
+        "and from the scatter between frames where that is more than 2.5 times what independent "
+        "noise says; an error of the model that is the same in all frames is not known to them.",
         "",
-        "| | derivative against secant | " + " | ".join(f"`{n}`" for n in u.names) + " |",
-        "|---|---:|" + "---:|" * len(u.names),
+        "| | scatter between frames | derivative against secant | "
+        + " | ".join(f"`{n}`" for n in u.names)
+        + " |",
+        "|---|---:|---:|" + "---:|" * len(u.names),
     ]
-    for name, mismatch, row in zip(u.names, u.mismatches, u.correlation, strict=True):
+    rows = zip(u.names, u.clustering, u.mismatches, u.correlation, strict=True)
+    for name, clustering, mismatch, row in rows:
         cells = " | ".join(f"{c:.2f}" for c in row)
-        lines.append(f"| `{name}` | {mismatch:.1%} | {cells} |")
+        lines.append(f"| `{name}` | {clustering:.2g} | {mismatch:.1%} | {cells} |")
     lines += ["", "Independent combinations, the best known first:", ""]
     for direction in u.directions():
         parts = " ".join(f"{w:+.2f} `{n}`" for w, n in zip(direction.weights, u.names, strict=True))

@@ -93,7 +93,7 @@ def _case(t: Table, path: Path, data: Path | None) -> CaseFile:
     channel = t.choice("channel", {"rgb": "rgb", "silhouette": "silhouette"}, "rgb")
     return CaseFile(
         path=path,
-        name=t.text("name", path.stem),
+        name=t.file_name("name", path.stem),
         scene=scene,
         scene_path=scene_path,
         unknowns=unknowns,
@@ -152,7 +152,7 @@ def _stage(t: Table, keys: list[str], fit_frames: int) -> Stage:
     for key in free or ():
         if key not in keys:
             raise t.error("free", f"name unknowns ({', '.join(keys)}){nearest(key, keys)}")
-    return Stage(frames, free, t.integer("coarser", 1))
+    return Stage(frames, free, t.integer("coarser", 1), t.boolean("keep", False))
 
 
 def fitted_content(case: CaseFile, values: dict[str, Any], dt: float) -> dict[str, Any]:

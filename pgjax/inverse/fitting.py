@@ -15,8 +15,10 @@ from pgjax.inverse.levenberg import (
     FitError,
     Point,
     Trial,
+    evaluate,
     levenberg_marquardt,
 )
+from pgjax.inverse.parameters import Space
 from pgjax.inverse.problem import AbstractProblem, costs
 from pgjax.inverse.uncertainty import Uncertainty, uncertainty
 
@@ -35,11 +37,14 @@ class Stage(NamedTuple):
             velocities, say, from the frames before a contact.
         coarser: pictures are seen through squares of so many pixels. While a body is off by more
             than what is drawn on it, single pixels lead nowhere.
+        keep: what is found is kept by what follows: what frames before a contact say of a velocity
+            must not be bent by errors of the model of the contact. Its uncertainty is passed on.
     """
 
     frames: int | None = None
     free: tuple[str, ...] | None = None
     coarser: int = 1
+    keep: bool = False
 
 
 @final
@@ -147,11 +152,12 @@ def fit(
             "Arguments `starts` and `trials` must be at least 1 and `tolerance` positive, but are "
             f"{starts}, {trials}, {tolerance}."
         )
+    _check_kept(problem, stages)
     run = _Run(problem, trials, tolerance, report)
     guesses = [problem.space.start]
     if starts > 1:
         guesses = run.screened(starts, seed)
-    ends: list[Descent] = []
+    ends: list[_End] = []
     failures: list[FitError] = []
     for guess in guesses:
         try:
@@ -160,29 +166,80 @@ def fit(
             failures.append(error)
     if not ends:
         raise failures[0]
-    ends.sort(key=lambda end: end.best.cost)
+    ends.sort(key=lambda end: end.last.descent.best.cost)
     best, *others = ends
+    point = run.evaluate(problem, best.u) if best.kept else best.last.descent.best
     found = None
     if intervals:
-        found = uncertainty(problem, best.best, noise_known=noise_known)
+        for part in best.known:
+            values = problem.space.known(best.u)
+            u = part.space.vector({n: values[n] for n in part.space.free})
+            found = uncertainty(part, run.evaluate(part, u), noise_known=noise_known, kept=found)
+        found = uncertainty(problem, point, noise_known=noise_known, kept=found)
         run.simulations += 2 * problem.space.size
-    messages = _messages(problem, best, others, failures)
+    messages = _messages(best, others, failures)
     if found is not None and np.isinf(found.degrees) and not noise_known:
         messages.append("There are no more data than unknowns: the noise given for them is taken.")
     return Fit(
         problem=problem,
-        values=problem.space.known(best.best.u),
-        point=best.best,
+        values=problem.space.known(best.u),
+        point=point,
         start=problem.space.start,
         trials=run.trials,
-        others=[end.best for end in others],
-        converged=best.converged,
-        reason=best.reason,
+        others=[end.last.descent.best for end in others],
+        converged=best.last.descent.converged,
+        reason=best.last.descent.reason,
         uncertainty=found,
         messages=messages,
         simulations=run.simulations,
         seconds=time.perf_counter() - began,
     )
+
+
+class _Part(NamedTuple):
+    """A descent.
+
+    Attributes:
+        problem: in what was free in it.
+        descent: how it ended.
+    """
+
+    problem: AbstractProblem
+    descent: Descent
+
+
+class _End(NamedTuple):
+    """Where one start led.
+
+    Attributes:
+        u: all free coordinates.
+        last: the descent in the whole problem.
+        kept: the stages whose parameters were kept.
+        known: their problems, with all that was kept by then free.
+    """
+
+    u: np.ndarray
+    last: _Part
+    kept: list[_Part]
+    known: list[AbstractProblem]
+
+
+def _check_kept(problem: AbstractProblem, stages: Sequence[Stage]) -> None:
+    """What is kept is not freed again, and something is left for the whole problem."""
+    held: set[str] = set()
+    for stage in stages:
+        names = set(stage.free or problem.space.free)
+        if stage.free is not None and names & held:
+            raise ValueError(
+                "Argument `stages` must not free again what an earlier one keeps, but frees "
+                f"{', '.join(sorted(names & held))}."
+            )
+        held |= names if stage.keep else set()
+    if held >= set(problem.space.free):
+        raise ValueError(
+            "Argument `stages` must leave a parameter for the whole problem, but keeps "
+            f"{', '.join(sorted(held))}."
+        )
 
 
 class _Run:
@@ -221,22 +278,42 @@ class _Run:
         order = [0, *(1 + np.argsort(usable[1:])[:_FOLLOWED])]
         return [points[k] for k in order if np.isfinite(usable[k])] or [space.start]
 
-    def follow(self, guess: np.ndarray, stages: Sequence[Stage]) -> Descent:
+    def follow(self, guess: np.ndarray, stages: Sequence[Stage]) -> _End:
         """Through the stages, then the whole problem."""
-        space = self.problem.space
-        u = guess
+        space, u = self.problem.space, guess
+        kept: list[_Part] = []
+        known: list[AbstractProblem] = []
+        held: list[str] = []
         for stage in stages:
-            part = self.problem if stage.frames is None else self.problem.until(stage.frames)
-            values = space.known(u)
+            whole = self.problem if stage.frames is None else self.problem.until(stage.frames)
             if stage.coarser != 1:
-                part = part.coarser(stage.coarser)
-            if stage.free is not None:
-                part = part.freeing(stage.free, values)
-            own = part.space.vector({n: values[n] for n in part.space.free})
-            end = self._descend(part, own, max(self.tolerance, _STAGE_TOLERANCE))
-            values = part.space.known(end.best.u)
-            u = space.vector({n: values[n] for n in space.free})
-        return self._descend(self.problem, u, self.tolerance)
+                whole = whole.coarser(stage.coarser)
+            names = [n for n in stage.free or space.free if n not in held]
+            tolerance = self.tolerance if stage.keep else max(self.tolerance, _STAGE_TOLERANCE)
+            u, part = self._solve(whole, names, u, tolerance)
+            if stage.keep:
+                held += names
+                kept.append(part)
+                known.append(whole.freeing(held, space.known(u)))
+        names = [n for n in space.free if n not in held]
+        u, last = self._solve(self.problem, names, u, self.tolerance)
+        return _End(u, last, kept, known)
+
+    def _solve(
+        self, whole: AbstractProblem, names: Sequence[str], u: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, _Part]:
+        """Descend in some of the parameters: all coordinates afterwards, and how it ended."""
+        space, values = self.problem.space, self.problem.space.known(u)
+        part = whole if len(names) == len(space.free) else whole.freeing(names, values)
+        own = part.space.vector({n: values[n] for n in part.space.free})
+        end = self._descend(part, own, tolerance)
+        values = part.space.known(end.best.u)
+        return space.vector({n: values[n] for n in space.free}), _Part(part, end)
+
+    def evaluate(self, problem: AbstractProblem, u: np.ndarray) -> Point:
+        """A point with all its derivatives."""
+        self.simulations += 1 + problem.space.size
+        return evaluate(problem, u)
 
     def _descend(self, problem: AbstractProblem, u: np.ndarray, tolerance: float) -> Descent:
         def told(trial: Trial) -> None:
@@ -260,28 +337,35 @@ def _line(problem: AbstractProblem, trial: Trial, seconds: float) -> str:
     return f"{seconds:7.1f} s  cost {trial.cost:.6g}  {shown}{note}"
 
 
-def _messages(
-    problem: AbstractProblem, best: Descent, others: list[Descent], failures: list[FitError]
-) -> list[str]:
+def _messages(best: _End, others: list[_End], failures: list[FitError]) -> list[str]:
     """What a reader of the estimate has to know."""
     messages = []
-    if not best.converged:
-        messages.append(f"The fit did not converge: {best.reason}.")
-    lower, upper = problem.space.bounds()
-    slopes, curvatures = best.best.slope, np.diag(best.best.curvature)
-    rows = zip(problem.names, best.best.u, lower, upper, slopes, curvatures, strict=True)
+    last = best.last.descent
+    if not last.converged:
+        messages.append(f"The fit did not converge: {last.reason}.")
+    for part in [*best.kept, best.last]:
+        messages += _at_bounds(part.problem.space, part.descent.best)
+    messages += last.best.status.messages()
+    messages += magnified(best.last.problem, last.best)
+    rivals = [end for end in others if end.last.descent.best.cost <= 1.05 * last.best.cost]
+    far = [end for end in rivals if np.abs(end.u - best.u).max() > 0.05]
+    if far:
+        messages.append(f"{len(far)} other start(s) ended elsewhere with a cost as low.")
+    messages += [f"A start could not be used: {error}" for error in failures]
+    return messages
+
+
+def _at_bounds(space: Space, point: Point) -> list[str]:
+    """Which coordinates ended on a bound that the data would cross."""
+    messages = []
+    lower, upper = space.bounds()
+    slopes, curvatures = point.slope, np.diag(point.curvature)
+    rows = zip(space.names, point.u, lower, upper, slopes, curvatures, strict=True)
     for name, u, low, high, slope, curvature in rows:
         for bound, side, sign in ((low, "lower", -1), (high, "upper", 1)):
-            pushes = -sign * slope > 1e-3 * np.sqrt(2 * best.best.cost * curvature)
+            pushes = -sign * slope > 1e-3 * np.sqrt(2 * point.cost * curvature)
             if abs(u - bound) <= 1e-9 * max(1.0, abs(bound)) and pushes:
                 messages.append(
                     f"{name} ended on its {side} bound: the data ask for a value beyond it."
                 )
-    messages += best.best.status.messages()
-    messages += magnified(problem, best.best)
-    rivals = [end for end in others if end.best.cost <= 1.05 * best.best.cost]
-    far = [e for e in rivals if np.abs(e.best.u - best.best.u).max() > 0.05]
-    if far:
-        messages.append(f"{len(far)} other start(s) ended elsewhere with a cost as low.")
-    messages += [f"A start could not be used: {error}" for error in failures]
     return messages

@@ -65,6 +65,12 @@ class Joint(AbstractProblem):
         """The problem in which pictures are seen through squares of so many pixels."""
         return self._with(self.space, tuple(p.coarser(pixels) for p in self.problems))
 
+    def moments(self) -> np.ndarray:
+        """Which frame of which motion each entry of the residual is of, `(m,)`."""
+        own = [problem.moments() for problem in self.problems]
+        firsts = np.cumsum([0] + [numbers.max() + 1 for numbers in own[:-1]])
+        return np.concatenate([first + n for first, n in zip(firsts, own, strict=True)])
+
     def with_space(self, space: Space) -> "Joint":
         """The same motions and data with other starts, or others of the parameters fixed."""
         return self._with(space, self.problems)

@@ -89,6 +89,10 @@ class AbstractProblem(eqx.Module):
         """The problem in which pictures are seen through squares of so many pixels."""
 
     @abc.abstractmethod
+    def moments(self) -> np.ndarray:
+        """Which instant each entry of the residual is of: numbers that differ, `(m,)`."""
+
+    @abc.abstractmethod
     def with_space(self, space: Space) -> "AbstractProblem":
         """The same motion and data with other starts, or others of the parameters fixed."""
 
@@ -199,6 +203,29 @@ class Problem(AbstractProblem):
         """The problem in which pictures are seen through squares of so many pixels."""
         seen = tuple(o.coarser(pixels) for o in self.observations)
         return self._with(self.space, seen, self.frames)
+
+    def moments(self) -> np.ndarray:
+        """Number of the frame each entry of the residual is of, `(m,)`."""
+
+        def parts(values: Values) -> list[Array]:
+            # The motion is not needed for its shape: the initial state, again and again.
+            _, state = self.build(values)
+            return [
+                o.residual(
+                    jax.tree.map(
+                        lambda a: jnp.broadcast_to(a, (self.frames + 1, *a.shape)), o.see(state)
+                    )
+                )
+                for o in self.observations
+            ]
+
+        shapes = jax.eval_shape(parts, self.space.values(self.space.start))
+        return np.concatenate(
+            [
+                np.repeat(o.frames, part.size // len(o.frames))
+                for o, part in zip(self.observations, shapes, strict=True)
+            ]
+        )
 
     def with_space(self, space: Space) -> "Problem":
         """The same motion and data with other starts, or others of the parameters fixed."""

@@ -17,6 +17,11 @@ from pgjax.inverse.problem import AbstractProblem, outcome
 LARGEST_MISMATCH = 0.2
 # A logarithm whose 95 % interval is wider than a factor of ten says nothing useful.
 WIDEST_LOGARITHM = np.log(10.0)
+# What is known from frame to frame to vary by more than this times what independent noise says is
+# taken from there.
+LARGEST_CLUSTERING = 2.5
+# Degrees of freedom without which a scatter says nothing.
+_LEAST_SCATTER = 5
 # Data without any noise must not divide by zero.
 _LEAST_NOISE = 1e-100
 # Secants over less than this are rounding (single, double precision).
@@ -66,10 +71,12 @@ class Uncertainty:
         noise: s, the standard deviation of the residuals: 1 if the noise that was given for the
             data is right and the model has no error.
         degrees: of freedom, of Student's distribution; infinite where the noise is taken as given.
+        clustering: per coordinate, the half width of a 95 % interval from the scatter between
+            frames over that from independent noise; NaN where there are too few frames.
         mismatches: per coordinate, derivative against secant over the 95 % interval; NaN where the
             secant could not be computed.
-        widening: factor of each deviation that the secant asks for, at least 1; infinite where
-            the interval is refused.
+        widening: factor of each deviation that clustering and secant ask for, at least 1; infinite
+            where the interval is refused.
         reasons: why a coordinate is not identifiable; empty where it is.
     """
 
@@ -79,13 +86,14 @@ class Uncertainty:
     covariance: np.ndarray
     noise: float
     degrees: float
+    clustering: np.ndarray
     mismatches: np.ndarray
     widening: np.ndarray
     reasons: tuple[str, ...]
 
     @property
     def deviations(self) -> np.ndarray:
-        """Standard deviations of the coordinates, widened where the secant asks for it, `(p,)`."""
+        """Standard deviations of the coordinates, widened where it is asked for, `(p,)`."""
         return np.sqrt(np.diag(self.covariance)) * self.widening
 
     @property
@@ -118,9 +126,22 @@ class Uncertainty:
         if self.reasons[j]:
             verdict, why = "not identifiable", self.reasons[j]
         elif self.widening[j] > 1:
-            verdict = "widened"
-            why = f"derivative and secant differ by {self.mismatches[j]:.0%} over the interval"
+            verdict, why = "widened", self._widened(j)
         return Interval(float(low), float(high), float(self.mismatches[j]), verdict, why)
+
+    def _widened(self, j: int) -> str:
+        """What asks for a wider interval."""
+        whys = []
+        if self.clustering[j] > LARGEST_CLUSTERING:
+            whys.append(
+                f"differences within a frame are alike: between frames it varies "
+                f"{self.clustering[j]:.3g} times as much as by independent noise"
+            )
+        if self.mismatches[j] > LARGEST_MISMATCH:
+            whys.append(
+                f"derivative and secant differ by {self.mismatches[j]:.0%} over the interval"
+            )
+        return "; ".join(whys)
 
     def quantile(self, level: float) -> float:
         """Half the width of an interval in standard deviations."""
@@ -135,41 +156,65 @@ class Uncertainty:
 
 
 def uncertainty(
-    problem: AbstractProblem, point: Point, *, noise_known: bool = False
+    problem: AbstractProblem,
+    point: Point,
+    *,
+    noise_known: bool = False,
+    kept: Uncertainty | None = None,
 ) -> Uncertainty:
     """The uncertainty of an estimate; two more simulations per coordinate check the derivative.
 
-    Along the direction in which a coordinate reaches the end of its 95 % interval, the derivative
-    is compared with the secant over that interval. Where they differ by more than 20 % the interval
-    is widened by what the secant asks for.
+    Errors of a model are no independent noise: differences within a frame are alike. Where
+    estimates scatter between frames by more than 2.5 times what independent noise says, the
+    interval is the one of that scatter (the sandwich covariance with one cluster per frame). Along
+    the direction in which a coordinate reaches the end of its 95 % interval, the derivative is then
+    compared with the secant over that interval. Where they differ by more than 20 % the interval is
+    widened by what the secant asks for.
 
     Args:
         problem: what was solved.
         point: where.
         noise_known: take the noise of the data as given (s = 1) instead of estimating it from the
-            residual.
+            residual. Clustering then is not looked for.
+        kept: of coordinates that were found before and then kept. What is not known of them is
+            passed on to the others.
+
+    Reference: K.-Y. Liang, S. Zeger, "Longitudinal data analysis using generalized linear models",
+    1986 (clusters); K. Murphy, R. Topel, "Estimation and inference in two-step econometric models",
+    1985 (what is kept).
     """
     noise, degrees = noise_of(problem, point, known=noise_known)
-    p = len(point.u)
+    p, names = len(point.u), problem.names
     # What was known before is not scaled by what the data say of their noise.
     information = point.rows @ point.rows.T / noise**2 + point.prior_rows @ point.prior_rows.T
-    covariance = covariance_of(information)
+    places = [] if kept is None else [names.index(name) for name in kept.names]
+    free = [j for j in range(p) if j not in places]
+    covariance = _covariance(information, free, places, kept)
     quantile = float(stats.t.ppf(0.975, degrees))
+    clustering = np.full(p, np.nan)
+    if not noise_known:
+        frames = problem.moments()
+        clustering[free] = _clustering(point, information, free, noise, quantile, frames)
+    wider = np.where(clustering > LARGEST_CLUSTERING, clustering, 1.0)
+    half = quantile * np.sqrt(np.diag(covariance)) * wider
     mismatches, widening, reasons = np.full(p, np.nan), np.ones(p), [""] * p
-    for j in range(p):
-        check = _against_secant(problem, point, covariance, noise, quantile, j)
+    for j in free:
+        check = _against_secant(problem, point, covariance[:, j], half[j], noise, j)
         mismatches[j], widening[j], reasons[j] = check
-    logarithmic = problem.space.logarithmic
-    half = quantile * np.sqrt(np.diag(covariance)) * widening
-    for j in range(p):
-        reasons[j] = reasons[j] or _too_wide(problem, point.u, half, j)
+        reasons[j] = reasons[j] or _too_wide(problem, point.u, half * widening, j)
+    widening *= wider
+    for j, place in enumerate(places):
+        assert kept is not None
+        clustering[place], mismatches[place] = kept.clustering[j], kept.mismatches[j]
+        widening[place], reasons[place] = kept.widening[j], kept.reasons[j]
     return Uncertainty(
-        names=tuple(problem.names),
+        names=tuple(names),
         u=point.u,
-        logarithmic=logarithmic,
+        logarithmic=problem.space.logarithmic,
         covariance=covariance,
         noise=noise,
         degrees=degrees,
+        clustering=clustering,
         mismatches=mismatches,
         widening=widening,
         reasons=tuple(reasons),
@@ -202,6 +247,47 @@ def covariance_of(curvature: np.ndarray) -> np.ndarray:
     return (vectors / values) @ vectors.T / np.outer(root, root)
 
 
+def _covariance(
+    information: np.ndarray, free: list[int], places: list[int], kept: Uncertainty | None
+) -> np.ndarray:
+    """Of all coordinates; an error of what was kept moves the others as their minimum moves."""
+    own = covariance_of(information[np.ix_(free, free)])
+    if kept is None:
+        return own
+    covariance = np.zeros_like(information)
+    known = np.where(np.isfinite(kept.widening), kept.widening, 1.0)
+    inner = kept.covariance * np.outer(known, known)
+    passed = -own @ information[np.ix_(free, places)]
+    covariance[np.ix_(free, free)] = own + passed @ inner @ passed.T
+    covariance[np.ix_(free, places)] = passed @ inner
+    covariance[np.ix_(places, free)] = inner @ passed.T
+    covariance[np.ix_(places, places)] = kept.covariance
+    return covariance
+
+
+def _clustering(
+    point: Point,
+    information: np.ndarray,
+    free: list[int],
+    noise: float,
+    quantile: float,
+    frames: np.ndarray,
+) -> np.ndarray:
+    """Half widths of intervals by the scatter between frames over those by independent noise."""
+    weighted = point.rows[free] * point.residual / noise**2
+    numbers = np.unique(frames[np.any(weighted != 0, axis=0)])
+    count = len(numbers)
+    degrees = count - 1 - len(free)
+    if degrees < _LEAST_SCATTER:
+        return np.full(len(free), np.nan)
+    slopes = np.stack([weighted[:, frames == number].sum(axis=1) for number in numbers])
+    slopes -= slopes.mean(axis=0)
+    own = covariance_of(information[np.ix_(free, free)])
+    robust = own @ (slopes.T @ slopes * count / degrees) @ own
+    factor = float(stats.t.ppf(0.975, degrees)) / quantile
+    return factor * np.sqrt(np.diag(robust) / np.diag(own))
+
+
 class _Check(NamedTuple):
     mismatch: float
     widening: float
@@ -211,19 +297,22 @@ class _Check(NamedTuple):
 def _against_secant(
     problem: AbstractProblem,
     point: Point,
-    covariance: np.ndarray,
+    covariances: np.ndarray,
+    half: float,
     noise: float,
-    quantile: float,
     j: int,
 ) -> _Check:
-    """Derivative and secant between the two ends of the interval of coordinate j."""
+    """Derivative and secant between the two ends of the interval of coordinate j.
+
+    `covariances` are those with j; `half` is half the width of its interval.
+    """
     dtype = np.dtype(jnp.zeros(()).dtype)
     shortest = _SHORTEST[dtype] * max(1.0, abs(point.u[j]) * (not problem.space.logarithmic[j]))
     # An interval below what is resolved is checked over what is.
-    length = max(quantile * np.sqrt(covariance[j, j]), shortest)
+    length = max(half, shortest)
     if problem.space.logarithmic[j] and length > WIDEST_LOGARITHM:
         return _Check(np.nan, np.inf, "its 95 % interval spans more than a factor of 100")
-    direction = covariance[:, j] / covariance[j, j] * length
+    direction = covariances / covariances[j] * length
     # Not so far that another logarithm, which the data may leave open, leaves the model.
     largest = np.max(np.abs(direction[problem.space.logarithmic]), initial=0)
     direction = direction * min(1.0, WIDEST_LOGARITHM / max(largest, 1e-300))
