@@ -40,7 +40,7 @@ class StandingWave(eqx.Module):
             return MU / 2 * (jnp.sum(F * F) - 3) - MU * log_J + LAM / 2 * log_J**2
 
         d = len(X)
-        F = jnp.eye(3).at[:d, :d].set(jax.jacfwd(self.place)(X, t))
+        F = jnp.eye(3, dtype=X.dtype).at[:d, :d].set(jax.jacfwd(self.place)(X, t))
         return jax.grad(energy)(F)[:d, :d]
 
     def __call__(self, X, t):
@@ -61,13 +61,13 @@ def wave(lib, X, t, space=0, time=0):
     return factor * along * lib.sin(2 * np.pi * SPEED * t + phase + time * np.pi / 2)
 
 
-def error(n, d, name, *, scheme=None, **kwargs):
+def error(n, d, name, *, scheme=None, across=1, **kwargs):
     """`max_t RMS |u − u_exact| / A` over one crossing, n cells per wave length, 2 per direction.
 
-    One dimension is two, one cell wide; `scheme` replaces that of `name`.
+    One dimension is two, `across` cells wide; `scheme` replaces that of `name`.
     """
     spline, standard, _ = SCHEMES[name]
-    shape = (n, 1) if d == 1 else (n,) * d
+    shape = (n, across) if d == 1 else (n,) * d
     D = len(shape)
     X = lattice((0,) * D, shape, 1 / n)
     moves = np.where(np.arange(D) < d, 1.0, 0.0)

@@ -28,13 +28,14 @@ def instead(monkeypatch, variant: Callable[[Variant], Variant]) -> None:
 def roomier(scene: Scene, state: State, cells: int) -> tuple[Scene, State]:
     """On a grid with so many more cells on each side, where it is not periodic."""
     grid, room = scene.grid, np.where(scene.grid.periodic, 0, cells)
-    shape = np.add(grid.shape, 2 * room)
-    larger = Grid(grid.origin - room * grid.h, shape, grid.h, periodic=grid.periodic)
+    shape = tuple(np.add(grid.shape, 2 * room).tolist())
+    origin = grid.origin - room.astype(float) * grid.h
+    larger = Grid(origin, shape, grid.h, periodic=grid.periodic)
     shift = (grid.origin - larger.origin).astype(state.dtype)
     state = eqx.tree_at(
         lambda s: (s.position, s.origin),
         state,
-        (state.position + shift, larger.origin.astype(state.dtype)),
+        (state.position + shift[None, :], larger.origin.astype(state.dtype)),
     )
     return eqx.tree_at(lambda s: s.grid, scene, larger), state
 
@@ -47,7 +48,7 @@ def with_room(cells: int) -> Callable[[Variant], Variant]:
             def back(larger, moved):
                 del larger
                 shift, origin = moved.origin - state.origin, state.origin
-                own = (moved.position + shift, origin)
+                own = (moved.position + shift[None, :], origin)
                 return observe(scene, eqx.tree_at(lambda s: (s.position, s.origin), moved, own))
 
             return usual(*roomier(scene, state, cells), dt, steps, back, after, every)
