@@ -22,10 +22,10 @@ from pgjax.inverse.matching import Chamfer as Chamfer
 from pgjax.inverse.matching import Sinkhorn as Sinkhorn
 from pgjax.inverse.observations import AbstractObservation as AbstractObservation
 from pgjax.inverse.observations import Cloud as Cloud
-from pgjax.inverse.observations import Pictures as Pictures
 from pgjax.inverse.observations import Positions as Positions
 from pgjax.inverse.parameters import Parameter as Parameter
 from pgjax.inverse.parameters import moduli as moduli
+from pgjax.inverse.pictures import Pictures as Pictures
 from pgjax.inverse.problem import Problem as Problem
 from pgjax.inverse.uncertainty import Interval as Interval
 from pgjax.inverse.uncertainty import Uncertainty as Uncertainty
