@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import re
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Tests spend most of their time compiling: keep what was compiled between runs.
@@ -12,6 +13,7 @@ os.environ.setdefault(
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import jax
+import jax.numpy as jnp
 import pytest
 from jaxtyping import install_import_hook
 
@@ -27,13 +29,15 @@ install_import_hook("pgjax", "typecheck.check")
 
 def pytest_configure(config):
     config.addinivalue_line("markers", "float64: needs double precision, or one of two passes")
+    config.addinivalue_line("markers", "hard: keeps the outcome of a hard case (`holds`)")
 
 
 def pytest_collection_modifyitems(items):
-    if FLOAT32:
-        for item in items:
-            if item.get_closest_marker("float64"):
-                item.add_marker(pytest.mark.skip(reason="needs double precision"))
+    for item in items:
+        if "holds" in item.fixturenames:
+            item.add_marker(pytest.mark.hard)
+        if FLOAT32 and item.get_closest_marker("float64"):
+            item.add_marker(pytest.mark.skip(reason="needs double precision"))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -103,6 +107,30 @@ def measure(request):
 
     check.curve = curve
     return check
+
+
+@pytest.fixture
+def holds(request):
+    """`holds(case, outcome="holds", material="any")`: keep the outcome of a hard case.
+
+    The outcome is "holds", "refused" (an error that names the argument) or "status: CONDITION".
+    What is demanded is the name of the test and the first sentence of its docstring.
+    """
+    title = re.sub(r"^test_(h\d\d_)?", "", request.function.__name__).replace("_", " ")
+    summary = " ".join((request.function.__doc__ or "").split("\n\n")[0].split())
+    summary = re.sub(r"^(\w\d+[,:. ]+)+", "", summary)
+
+    def keep(case, *, outcome="holds", material="any", precision=None):
+        row = {
+            "case": case,
+            "what": f"{title}: {summary}" if summary else title,
+            "material": material,
+            "precision": precision or jnp.zeros(()).dtype.name,
+            "outcome": outcome,
+        }
+        request.node.user_properties.append(("hard", row))
+
+    return keep
 
 
 def pytest_addoption(parser):

@@ -62,7 +62,7 @@ FAR = [cells * sign for cells in (1.6, 2.6, 11, 1e9) for sign in (-1, 1)]
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("cells", [*FAR, 1e30, -1e30])
-def test_a_particle_outside_is_masked_and_the_others_untouched(axis, cells):
+def test_a_particle_outside_is_masked_and_the_others_untouched(axis, cells, holds):
     """H19: below 0 and beyond N, near and absurdly far; nothing wraps round."""
     scene = scene_of()
     state = started(scene)
@@ -76,11 +76,12 @@ def test_a_particle_outside_is_masked_and_the_others_untouched(axis, cells):
     assert int(end.status.count[Condition.OUT_OF_DOMAIN]) == 1
     assert int(end.status.count[Condition.NONFINITE]) == 0
     same_bits(end, expected, slice(1, None))
+    holds("H19", outcome="status: OUT_OF_DOMAIN")
 
 
 @pytest.mark.parametrize("field", ["position", "v", "C", "He"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_nan_in_mid_run_stays_with_its_particle(field, value):
+def test_nan_in_mid_run_stays_with_its_particle(field, value, holds):
     """H22: the others are bitwise those of a run in which the particle is masked at that step."""
     scene = scene_of()
     state = rollout(scene, started(scene), DT)
@@ -91,9 +92,10 @@ def test_nan_in_mid_run_stays_with_its_particle(field, value):
     same_bits(end, expected, np.arange(8) != 3)
     assert int(end.status.first[Condition.NONFINITE]) == 12
     assert int(end.status.count[Condition.NONFINITE]) == 1
+    holds("H22", outcome="status: NONFINITE")
 
 
-def test_nan_of_a_users_force_is_found():
+def test_nan_of_a_users_force_is_found(holds):
     """H53: only the particle it was given to is lost."""
 
     def force(X0, t):
@@ -107,6 +109,7 @@ def test_nan_of_a_users_force_is_found():
     np.testing.assert_array_equal(np.flatnonzero(~np.asarray(end.alive)), [5])
     assert int(end.status.first[Condition.NONFINITE]) == 4
     assert np.isfinite(np.asarray(end.position)).all()
+    holds("H53", outcome="status: NONFINITE")
 
 
 def test_the_error_says_when_and_what_to_do():
@@ -128,7 +131,7 @@ def test_the_error_says_when_and_what_to_do():
     assert (np.asarray(trajectory.final.v) == 0).all()
 
 
-def test_far_above_the_bound_nothing_crashes():
+def test_far_above_the_bound_nothing_crashes(holds):
     """H13: at 25 times the stable step the run ends, and says at which step it broke."""
     scene = scene_of()
     state = replaced(started(scene), "He", (0, 0, 0), 0.2)
@@ -143,6 +146,7 @@ def test_far_above_the_bound_nothing_crashes():
     assert int(lost.sum()) > 0
     first = end.status.first[np.array([Condition.NONFINITE, Condition.OUT_OF_DOMAIN])]
     assert 0 < int(first.min()) < 200
+    holds("H13", outcome="refused; overridden: status: NONFINITE or OUT_OF_DOMAIN")
 
 
 @pytest.mark.parametrize(

@@ -116,17 +116,6 @@ def test_smallest_stretch_is_accurate_in_float32():
     assert abs(np.asarray(sigma)[:, 2] / exact - 1).max() < 2e-4
 
 
-@pytest.mark.parametrize("law", [pm.StVKHencky, svd.StVKHenckySVD])
-def test_loss_of_ellipticity_and_clamping_are_reported(law):
-    """H42: uniaxial stretch beyond e. H52: a stretch below 1e-4."""
-    elasticity = law(laws.E, laws.NU)
-    stretch = jnp.array([[2.71, 1.0, 1], [2.73, 1, 1], [1.1e-4, 1, 1], [0.9e-4, 1, 1]])
-    H = jax.vmap(jnp.diag)(stretch - 1)
-    elliptic, clamped = (jax.vmap(f)(H) for f in (elasticity.elliptic, elasticity.clamped))
-    assert elliptic.tolist() == [True, False, True, True]
-    assert clamped.tolist() == [False, False, False, True]
-
-
 # --- H39-H41: limits of the parameters -----------------------------------------------------------
 
 
@@ -180,16 +169,19 @@ def test_paste_without_viscosity_is_plastic_and_of_infinite_viscosity_elastic(na
 
 
 @pytest.mark.parametrize("name", SAND)
-def test_sand_without_friction_bears_no_shear_and_keeps_its_pressure(name):
+def test_sand_without_friction_bears_no_shear_and_keeps_its_pressure(name, holds):
+    """H39: φ = 0, at rest and under pressure too; derivatives are finite."""
     H, _, tau = limit(name, friction_angle=0.0)
     trial = run("StVKHencky", H + I3)[2]
     assert norm(dev(tau)).max() < 500 * ROUNDING * laws.E
     compressed = np.trace(trial, axis1=1, axis2=2) < 0
     assert norm(tau - trial + dev(trial))[compressed].max() < 500 * ROUNDING * laws.E
+    holds("H39", material=name)
 
 
 @pytest.mark.parametrize("name", SAND)
-def test_sand_of_the_steepest_friction_lies_on_its_cone(name):
+def test_sand_of_the_steepest_friction_lies_on_its_cone(name, holds):
+    """H39: φ just below 90 degrees."""
     _, _, tau = limit(name, friction_angle=89.999)
     plasticity = eqx.tree_at(
         lambda p: getattr(p, "law", p).friction_angle,
@@ -198,19 +190,7 @@ def test_sand_of_the_steepest_friction_lies_on_its_cone(name):
     )
     excess = laws.overshoot(plasticity, LAWS[name].material.elasticity, tau, None)
     assert excess.max() < 5000 * ROUNDING * laws.E
-
-
-@pytest.mark.parametrize("name", ["VonMises", "HerschelBulkley-plastic"])
-def test_huge_trial_strain_returns_to_the_surface_in_float32(name):
-    """H41: a trial stress of a thousand times the yield stress, at stretches of about e."""
-    F = laws.with_stretches(np.random.default_rng(9), np.array([[2.7, 1, 1 / 2.7]] * 48))
-    weak = eqx.tree_at(lambda m: m.plasticity.yield_stress, LAWS[name].material, jnp.asarray(0.007))
-    material, H = cast(weak, jnp.float32), jnp.asarray(F - I3, jnp.float32)
-    trial = norm(dev(jax.vmap(lambda H: material.elasticity.kirchhoff(H, H))(H)))
-    _, _, tau = respond(material, H, None)
-    excess = laws.overshoot(material.plasticity, material.elasticity, tau, None)
-    assert trial.min() > 1000 * 0.007
-    assert (abs(excess) / trial).max() < 4e-6
+    holds("H39", material=name)
 
 
 # --- Single precision ----------------------------------------------------------------------------
@@ -280,9 +260,11 @@ def test_negative_plastic_constants_are_refused(law, good, bad):
 
 
 @pytest.mark.parametrize("angle", [90.0, 120.0, np.inf])
-def test_a_vertical_cone_is_refused(angle):
+def test_a_vertical_cone_is_refused(angle, holds):
+    """H39: φ = 90 degrees and more."""
     with pytest.raises(ValueError, match="Argument `friction_angle` must be below 90 degrees"):
         pm.DruckerPrager(angle)
+    holds("H39", material="DruckerPrager", outcome="refused")
 
 
 @pytest.mark.parametrize("h", [0.0, np.inf])

@@ -273,7 +273,7 @@ def test_keeping_the_states_changes_nothing_but_the_memory():
     assert 256 < much < 256 + 64 + 60
 
 
-def test_materials_far_apart_do_not_meet(measure):
+def test_materials_far_apart_do_not_meet(measure, holds):
     """H43: slices of one scene equal separate scenes."""
     x, v = particles(12, size=0.2)
     x = x + 0.6 * (np.arange(12) >= 6)[:, None] - 0.2
@@ -289,6 +289,7 @@ def test_materials_far_apart_do_not_meet(measure):
         )
         law = type(material.elasticity).__name__
         measure("H43", f"{law} beside another material = alone, 30 steps", gap, below=1e-13)
+        holds("H43", material=law)
 
 
 @pytest.mark.float64

@@ -19,6 +19,9 @@ from benchmarks.verification.plots import draw
 ROOT = pathlib.Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 COMMAND = "python -m benchmarks.verification"
+# Where the tests are that keep the outcome of a hard case.
+ELSEWHERE = ("failures", "linalg", "model_limits", "rollout", "timestep")
+HARD = ["tests/hard", *(f"tests/test_{name}.py" for name in ELSEWHERE)]
 
 
 def table(rows: list[dict]) -> str:
@@ -36,17 +39,26 @@ def table(rows: list[dict]) -> str:
 def matrix(hard: list[dict]) -> str:
     """What held in the hard cases, by case, material and precision, as a Markdown table."""
     precisions = sorted({row["precision"] for row in hard})
-    found: dict[tuple[str, str], dict[str, str]] = {}
+    outcomes: dict[tuple[str, str, str], list[list[str]]] = {}
     for row in hard:
-        found.setdefault((row["case"], row["material"]), {})[row["precision"]] = row["outcome"]
-    lines = [
-        "| case | material | " + " | ".join(precisions) + " |",
-        "|---|---|" + "---|" * len(precisions),
+        key = row["case"], row["what"], row["material"]
+        cells = outcomes.setdefault(key, [[] for _ in precisions])
+        cell = cells[precisions.index(row["precision"])]
+        if row["outcome"] not in cell:
+            cell.append(row["outcome"])
+    # Materials with the same outcome share a line.
+    lines: dict[tuple[str, ...], list[str]] = {}
+    for (case, what, material), cells in outcomes.items():
+        lines.setdefault((case, what, *("; ".join(c) for c in cells)), []).append(material)
+    table = [
+        "| case | what is demanded | material | " + " | ".join(precisions) + " |",
+        "|---|---|---|" + "---|" * len(precisions),
     ]
-    for (case, material), outcomes in sorted(found.items()):
-        cells = " | ".join(outcomes.get(p, "") for p in precisions)
-        lines.append(f"| {case} | {material} | {cells} |")
-    return "\n".join(lines) + "\n"
+    for (case, what, *cells), materials in sorted(lines.items()):
+        named = ", ".join(m for m in dict.fromkeys(materials) if m != "any")
+        what = what.replace("|", "\\|")
+        table.append(f"| {case} | {what} | {named} | {' | '.join(cells)} |")
+    return "\n".join(table) + "\n"
 
 
 def report(rows: list[dict], command: str, picture: str | None) -> str:
@@ -61,11 +73,13 @@ def report(rows: list[dict], command: str, picture: str | None) -> str:
     )
 
 
-def pytest(cases: list[str], arguments: list[str], *, float32: bool = False) -> tuple[int, dict]:
+def pytest(
+    cases: list[str], arguments: list[str], *, marked: str = "", float32: bool = False
+) -> tuple[int, dict]:
     """Run tests, slow ones included: the exit status, and what they kept."""
     with tempfile.TemporaryDirectory() as folder:
         kept = pathlib.Path(folder) / "kept.json"
-        options = ["-m", "", "--measured", str(kept), *arguments]
+        options = ["-m", marked, "--measured", str(kept), *arguments]
         env = {**os.environ, "PGJAX_TEST_FLOAT32": str(int(float32))}
         command = [sys.executable, "-m", "pytest", *cases, *options]
         code = subprocess.call(command, cwd=ROOT, env=env)
@@ -93,7 +107,7 @@ def verify_hard_cases(arguments: list[str]) -> int:
     """The hard cases in both precisions: `verification_hard.json` and `.md`."""
     codes, rows = [], []
     for float32 in (False, True):
-        code, kept = pytest(["tests/hard"], arguments, float32=float32)
+        code, kept = pytest(HARD, arguments, marked="hard", float32=float32)
         codes.append(code)
         rows += kept.get("hard", [])
     if rows:
