@@ -9,6 +9,7 @@ import pytest
 import pgjax
 import pgjax.models as pm
 from hard.bodies import (
+    MATERIALS,
     NU,
     RHO,
     E,
