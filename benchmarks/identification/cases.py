@@ -36,11 +36,11 @@ def _on_floor(volumes, materials, resolution: Resolution, **settings) -> pgjax.S
     )
 
 
-def _thrown(material_of, size=(0.3, 0.22, 0.26), center=(0.0, 0.0, 0.32)):
+def _thrown(material_of, height, size=(0.3, 0.22, 0.26)):
     """A tilted block thrown at a sticky floor: the build of a picture case."""
 
     def build(resolution: Resolution):
-        x, volumes = tilted_block(size, center, resolution)
+        x, volumes = tilted_block(size, (0.0, 0.0, height), resolution)
 
         def of(values):
             scene = _on_floor(volumes, material_of(values), resolution)
@@ -73,7 +73,8 @@ def _pictured(name, truth, parameters, material_of, targets, **settings) -> Case
         name=name,
         truth=truth,
         parameters={**parameters, "v0": _velocity()},
-        build=_thrown(material_of),
+        # So high that the first frame is before the contact.
+        build=_thrown(material_of, settings.pop("height", 0.4)),
         resolution=Resolution(settings.pop("cells", 30)),
         frames=14,
         frame_dt=1 / 24,
@@ -96,6 +97,7 @@ def _elastic(E: float, name: str) -> Case:
         cells=32,
         # So that the rebound stays before the cameras.
         v0=(0.3, 0.4, -1.0),
+        height=0.32,
     )
 
 
