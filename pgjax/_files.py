@@ -1,6 +1,7 @@
-"""Writing a file so that it is there complete, or not at all."""
+"""Files: written so that they are there complete or not at all, read without trust in them."""
 
 import contextlib
+import math
 import os
 import uuid
 from collections.abc import Iterator
@@ -43,3 +44,45 @@ def with_suffix(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> Path
             f"Argument `path` must end with {' or '.join(suffixes)}, but is {target.name!r}."
         )
     return target
+
+
+def read_text(file: Path, most: int) -> str:
+    """The text of a file in UTF-8; a `ValueError` if it is none or takes more than `most` bytes."""
+    with file.open("rb") as stream:
+        raw = stream.read(most + 1)
+    if len(raw) > most:
+        raise ValueError(f"it is larger than {most >> 20} MiB")
+    return raw.decode("utf-8")
+
+
+def require_memory(file: Path, size: int) -> None:
+    """Refuse a file whose content, unpacked, takes more bytes than this machine has."""
+    if size > memory():
+        raise ValueError(
+            f"The file {file} is too large: its content takes {size / 2**30:.3g} GiB of memory, "
+            f"but there are {memory() / 2**30:.3g}."
+        )
+
+
+def memory() -> float:
+    """Bytes of memory of this machine; infinity where the system does not say."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is an ordinary file, no pipe or device; what cannot be a path is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder; what cannot be a path is none."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False

@@ -14,7 +14,7 @@ import numpy as np
 from pgjax._types import Array, Float, Scalar, concrete
 from pgjax.ledger import Flows, Ledger, balance, followed
 from pgjax.monitor import note_frame, note_start
-from pgjax.result import SimulationWarning, Status
+from pgjax.result import NEVER, SimulationWarning, Status
 from pgjax.scene import Scene
 from pgjax.state import State
 from pgjax.step import followed_step, step
@@ -121,6 +121,7 @@ def simulate(
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"Argument `{name}` must be a whole number ≥ 1, but is {value!r}.")
     frames, substeps = int(frames), int(substeps)
+    _check_count(state, frames * substeps)
     _check_particles(scene, state)
     _check_dt(scene, dt, allow_unstable)
     report = _meter(frames) if progress is True else progress or None
@@ -138,6 +139,17 @@ def simulate(
     if throw:
         trajectory.status.check()
     return trajectory
+
+
+def _check_count(state: State, steps: int) -> None:
+    """The counter of steps has 31 bits."""
+    before = concrete(state.step)
+    done = 0 if before is None else int(before.max())
+    if done + steps >= NEVER:
+        raise ValueError(
+            f"Arguments `frames` and `substeps` must make fewer than 2^31 steps together with the "
+            f"{done} before, but make {steps}."
+        )
 
 
 def _check_particles(scene: Scene, state: State) -> None:

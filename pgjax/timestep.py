@@ -10,6 +10,7 @@ import numpy as np
 from pgjax._types import Array, Bool, Float, Scalar, concrete, require
 from pgjax.models.material import cast, particle_axes
 from pgjax.models.viscous import positive_volume
+from pgjax.result import NEVER
 from pgjax.scene import Scene
 from pgjax.state import State
 
@@ -117,4 +118,12 @@ def stable_dt(
 
 def substeps_for(frame: float, dt: float) -> int:
     """The smallest number of equal substeps of at most dt that make a frame exactly."""
-    return max(1, int(np.ceil(frame / dt * (1 - 1e-9))))
+    # A step of 0 is one that is below the smallest number.
+    steps = float(frame) / float(dt) * (1 - 1e-9) if dt > 0 else np.inf
+    if not steps < NEVER - 1:
+        raise ValueError(
+            f"A frame of {frame:g} s must take fewer than 2^31 steps, but the stable ones are of "
+            f"{dt:g} s: is a material too stiff or too light, a particle too fast, or a frame too "
+            f"long?"
+        )
+    return max(1, int(np.ceil(steps)))

@@ -101,9 +101,10 @@ class Camera(eqx.Module):
         """
         position, up = _vector("eye", eye), _vector("up", up)
         forward = _vector("target", target) - position
-        if np.linalg.norm(forward) == 0:
+        distance = math.hypot(*forward)
+        if distance == 0:
             raise ValueError(f"Argument `target` must differ from `eye`, but both are {position}.")
-        forward = forward / np.linalg.norm(forward)
+        forward = forward / distance
         right = np.cross(forward, up)
         if np.linalg.norm(right) <= 1e-9 * np.linalg.norm(up):
             raise ValueError(

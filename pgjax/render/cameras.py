@@ -4,18 +4,26 @@ import contextlib
 import json
 import math
 import os
+import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pgjax._files import is_file, is_folder, read_text
 from pgjax.render.camera import Camera
 from pgjax.render.colmap import Lens, read_model
 
 _CURE = "Undistort the images with COLMAP (`colmap image_undistorter`) and use its cameras."
 _DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+# Bytes; 10 000 cameras take half of it.
+_LARGEST_JSON = 16 << 20
+_LARGEST_SIZE = 2**31 - 1  # pixels
+# Of a value of any length a message shows as much as fits into a line.
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = 80
 # OpenGL axes (x right, y up, z back) from OpenCV axes (x right, y down, z forward).
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -41,9 +49,9 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     Reference: COLMAP documentation, "Output Format"; nerfstudio documentation, "Data conventions".
     """
     file = Path(path)
-    if file.is_dir():
+    if is_folder(file):
         pairs = _colmap(file)
-    elif file.is_file():
+    elif is_file(file):
         content = _json(file)
         if isinstance(content, list):
             pairs = _inria(file, content)
@@ -96,8 +104,9 @@ def _naming(file: Path, name: str) -> Iterator[None]:
 
 
 def _whole(name: str, value: float) -> int:
-    if not float(value).is_integer():
-        raise ValueError(f"Argument `{name}` must be a whole number, but is {value}.")
+    if not abs(value) <= _LARGEST_SIZE or value != int(value):
+        rule = f"be a whole number, at most {_LARGEST_SIZE}"
+        raise ValueError(f"Argument `{name}` must {rule}, but is {_SHORT.repr(value)}.")
     return int(value)
 
 
@@ -124,7 +133,7 @@ def _require_pinhole(
 
 def _json(file: Path) -> Any:
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(read_text(file, _LARGEST_JSON))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"The file {file} is not valid JSON: {error}.") from None
 
@@ -147,13 +156,15 @@ def _array(entry: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> np.n
         raise ValueError(f"The key `{key}` is missing.")
     try:
         array = np.asarray(entry[key], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"The key `{key}` must hold numbers, but holds {entry[key]!r}.") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"The key `{key}` must hold numbers, but holds {_SHORT.repr(entry[key])}."
+        ) from None
     if array.shape not in shapes:
         rule = " or ".join(str(shape) for shape in shapes)
         raise ValueError(f"The key `{key}` must have shape {rule}, but has {array.shape}.")
     if not np.isfinite(array).all():
-        raise ValueError(f"The key `{key}` must be finite, but is {entry[key]!r}.")
+        raise ValueError(f"The key `{key}` must be finite, but is {_SHORT.repr(entry[key])}.")
     return array
 
 

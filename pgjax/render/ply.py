@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from pgjax._files import replacing
+from pgjax._files import replacing, require_memory
 from pgjax.render import compressed
 from pgjax.render.gaussians import Gaussians
 from pgjax.render.harmonics import COUNTS, rotate_coefficients
@@ -27,7 +27,11 @@ _SIZES = {
     **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
-_MAX_HEADER = 1 << 20
+_MAX_HEADER = 1 << 18
+# Rows of lists, of which Gaussians have none: each takes a microsecond.
+_MOST_LISTS = 100_000
+# In double precision, and once more on the way.
+_IN_MEMORY = 4
 # exp, log and logit stay finite in single precision within these.
 _MAX_LOGIT, _MIN_SCALE = 50.0, 1e-35
 
@@ -127,14 +131,17 @@ def _read_header(file: Path) -> _Header:
         head = stream.read(_MAX_HEADER)
     if head[:4].rstrip() != b"ply":
         raise ValueError(f"The file {file} is not a .ply: it does not begin with the line `ply`.")
-    lines, found, _ = head.partition(b"end_header")
-    if not found:
+    newline = _newline(head)
+    lines = head.split(newline)
+    # A line of its own: in a comment the words end nothing.
+    end = next((i for i, line in enumerate(lines) if line.split() == [b"end_header"]), None)
+    if end is None:
         raise ValueError(f"The file {file} is truncated: its header has no end.")
     counts: dict[str, int] = {}
     properties: dict[str, dict[str, str]] = {}
     name = ""
-    binary = b"ascii" not in lines.split(b"element")[0]
-    for line in lines.decode("ascii", errors="replace").splitlines():
+    binary = not any(line.split()[:2] == [b"format", b"ascii"] for line in lines[:end])
+    for line in (line.decode("ascii", errors="replace") for line in lines[:end]):
         words = line.split()
         try:
             if words[:1] == ["element"]:
@@ -143,10 +150,17 @@ def _read_header(file: Path) -> _Header:
             elif words[:1] == ["property"]:
                 properties[name][words[-1]] = words[1]
         except (IndexError, KeyError, ValueError):
-            raise ValueError(f"The file {file} has a broken header line: {line!r}.") from None
+            raise ValueError(f"The file {file} has a broken header line: {line[:80]!r}.") from None
     header = _Header(counts, properties)
-    _require_room(file, header, len(lines) + len("end_header\n"), binary)
+    size = sum(len(line) + len(newline) for line in lines[: end + 1])
+    _require_room(file, header, size, binary)
     return header
+
+
+def _newline(head: bytes) -> bytes:
+    """What ends the first line, and every other one of the header."""
+    after = head[3:5]
+    return after if after == b"\r\n" else after[:1]
 
 
 def _require_room(file: Path, header: _Header, header_size: int, binary: bool) -> None:
@@ -165,6 +179,13 @@ def _require_room(file: Path, header: _Header, header_size: int, binary: bool) -
             f"The file {file} is truncated or its header is wrong: it declares {rows}, which take "
             f"{needed} bytes, but only {available} follow the header."
         )
+    for name, kinds in header.properties.items():
+        if "list" in kinds.values() and header.counts[name] > _MOST_LISTS:
+            raise ValueError(
+                f"The file {file} must have at most {_MOST_LISTS} rows of lists, but has "
+                f"{header.counts[name]} of {name!r}."
+            )
+    require_memory(file, _IN_MEMORY * needed)
 
 
 def _checked_columns(file: Path, header: _Header) -> int:

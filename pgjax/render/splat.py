@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pgjax._files import require_memory
+
 _RECORD = np.dtype(
     [
         ("position", "<f4", 3),
@@ -34,6 +36,8 @@ def read_splat(file: Path) -> list[np.ndarray]:
             f"The file {file} is not a complete .splat: it must hold a positive multiple of "
             f"{_RECORD.itemsize} bytes, but holds {size}."
         )
+    # Numbers in double precision, the harmonics by themselves.
+    require_memory(file, 4 * size)
     records = np.fromfile(file, dtype=_RECORD)
     negative = int(np.count_nonzero((records["scale"] < 0).any(axis=1)))
     if negative:

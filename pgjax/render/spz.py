@@ -13,10 +13,11 @@ import struct
 import warnings
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
+from pgjax._files import require_memory
 from pgjax.render.compressed import with_largest
 from pgjax.render.harmonics import COUNTS, MAX_DEGREE, basis
 
@@ -25,8 +26,12 @@ _HEADER = struct.Struct("<4sIIBBBx")
 _VERSIONS = (1, 2, 3)
 _ANTIALIASED = 1
 _COLOUR_SCALE = 0.15
-# Deflate cannot shrink anything further than 258 bytes to 2 bits.
-_MAX_RATIO = 1032
+# Deflate cannot shrink anything further than 258 bytes to 2 bits. No capture shrinks as far as the
+# second, which holds for more than so many bytes.
+_MAX_RATIO, _REAL_RATIO, _SMALL = 1032, 50, 64 << 20
+_CHUNK = 1 << 20
+# A byte becomes a number in double precision.
+_IN_MEMORY = 8
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 
 
@@ -53,18 +58,12 @@ def read_spz(file: Path) -> list[np.ndarray]:
         ValueError: the file is not a complete gzip stream of a known version, or its header
             promises more than the file can hold.
     """
-    data = file.read_bytes()
-    if data[:4] == _MAGIC:
-        version = int.from_bytes(data[4:8], "little")
-        raise ValueError(
-            f"The file {file} is an .spz of version {version} that is not a gzip stream. "
-            "Versions 1 to 3, which are, can be read."
-        )
-    stream = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
-    header = _read_header(file, _inflate(file, stream, data, _HEADER.size), len(data))
-    needed = header.number * sum(header.widths)
-    # One byte more than needed, so that the check sum at the end is reached and verified.
-    body = _inflate(file, stream, stream.unconsumed_tail, needed + 1)
+    with file.open("rb") as source:
+        stream = _Stream(file, source)
+        header = _read_header(file, stream.take(_HEADER.size), file.stat().st_size)
+        needed = header.number * sum(header.widths)
+        # One byte more than needed, so that the check sum at the end is reached and verified.
+        body = stream.take(needed + 1)
     if len(body) > needed:
         raise ValueError(
             f"The file {file} goes on after the {header.number} Gaussians that its header declares."
@@ -83,15 +82,39 @@ def read_spz(file: Path) -> list[np.ndarray]:
     return _decoded(header, body)
 
 
-def _inflate(file: Path, stream: "zlib._Decompress", data: bytes, limit: int) -> bytes:
-    """At most `limit` bytes of what `data` expands to."""
-    try:
-        return stream.decompress(data, limit)
-    except zlib.error as error:
-        raise ValueError(f"The file {file} cannot be read as .spz: {error}.") from None
+class _Stream:
+    """A gzip stream that is expanded as far as it is asked for, whatever lies behind that."""
+
+    def __init__(self, file: Path, source: BinaryIO):
+        self._file, self._source = file, source
+        self._inflater = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+        self._data = source.read(_CHUNK)
+        if self._data[:4] == _MAGIC:
+            version = int.from_bytes(self._data[4:8], "little")
+            raise ValueError(
+                f"The file {file} is an .spz of version {version} that is not a gzip stream. "
+                "Versions 1 to 3, which are, can be read."
+            )
+
+    @property
+    def eof(self) -> bool:
+        """Whether the end was reached, and its check sum is right."""
+        return self._inflater.eof
+
+    def take(self, count: int) -> bytearray:
+        """The next bytes, at most so many; fewer where the stream ends."""
+        taken = bytearray()
+        while len(taken) < count and self._data and not self.eof:
+            try:
+                taken += self._inflater.decompress(self._data, count - len(taken))
+            except zlib.error as error:
+                fault = f"cannot be read as .spz: {error}"
+                raise ValueError(f"The file {self._file} {fault}.") from None
+            self._data = self._inflater.unconsumed_tail or self._source.read(_CHUNK)
+        return taken
 
 
-def _read_header(file: Path, head: bytes, size: int) -> _Header:
+def _read_header(file: Path, head: bytearray, size: int) -> _Header:
     """Check the header, also against the size of the file, before anything else is expanded."""
     if len(head) < _HEADER.size or head[:4] != _MAGIC:
         raise ValueError(f"The file {file} is not an .spz: its content does not begin with NGSP.")
@@ -113,15 +136,16 @@ def _read_header(file: Path, head: bytes, size: int) -> _Header:
     if header.number == 0:
         raise ValueError(f"The file {file} holds no Gaussians.")
     needed = header.number * sum(header.widths)
-    if needed > _MAX_RATIO * size:
+    if needed > (_MAX_RATIO if needed <= _SMALL else _REAL_RATIO) * size:
         raise ValueError(
             f"The file {file} is truncated or its header is wrong: it declares {header.number} "
             f"Gaussians, which take {needed} bytes, more than its {size} bytes can expand to."
         )
+    require_memory(file, _IN_MEMORY * needed)
     return header
 
 
-def _decoded(header: _Header, body: bytes) -> list[np.ndarray]:
+def _decoded(header: _Header, body: bytearray) -> list[np.ndarray]:
     n = header.number
     ends = np.cumsum([n * width for width in header.widths])[:-1]
     parts = np.split(np.frombuffer(body, dtype=np.uint8), ends)

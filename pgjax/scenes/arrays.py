@@ -68,7 +68,7 @@ def _load(t: Table, key: str, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     where = f"{t.name}: `{key}` = {path.name!r}"
     try:
         values = _read_npy(path)
-    except (ValueError, OSError, EOFError, MemoryError) as error:
+    except Exception as error:  # Whatever is wrong with the file.
         raise SceneError(f"{where} must be an array of numbers in .npy format: {error}.") from error
     if values.ndim != 1 + len(shape) or values.shape[1:] != shape or len(values) == 0:
         rule = " x ".join(["n", *map(str, shape)])

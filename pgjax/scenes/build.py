@@ -9,6 +9,7 @@ import numpy as np
 from pgjax.boundary import AbstractParticleCondition
 from pgjax.grid import Grid
 from pgjax.render import Camera, Gaussians, Similarity, concatenate
+from pgjax.result import NEVER
 from pgjax.scene import Scene, initial_state
 from pgjax.scenes.camera import CameraPart
 from pgjax.scenes.capture import body
@@ -95,7 +96,7 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         state = initial_state(scene, crowd.x, v, C=C)
         longest = _longest_step(file, scene, state)
         substeps = substeps_for(1 / file.time.fps, longest)
-    return Plan(
+    made = Plan(
         name=file.name,
         scene=scene,
         state=state,
@@ -111,6 +112,20 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         models=file.models,
         body=crowd.body,
     )
+    _require_countable(made, file.source)
+    # What is too far or too near for the numbers of the simulation is said now.
+    with naming(f"{file.source} [camera]"):
+        for frame in (0, made.frames):
+            made.camera(frame)
+    return made
+
+
+def _require_countable(made: Plan, source: str) -> None:
+    if made.frames * made.substeps >= NEVER:
+        raise SceneError(
+            f"{source} [time]: `frames` must be at most {(NEVER - 1) // made.substeps} of "
+            f"{made.substeps} steps each, fewer than 2^31 in all, but is {made.frames}."
+        )
 
 
 def _longest_step(file: SceneFile, scene: Scene, state: State) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from pgjax.render import Camera, CameraPath, load_cameras
 from pgjax.scenes.model import ModelPart
-from pgjax.scenes.reader import REQUIRED, Table, naming, nearest
+from pgjax.scenes.reader import REQUIRED, SceneError, Table, naming, nearest
 from pgjax.scenes.regions import Triple
 from pgjax.scenes.views import Look, LookPath, Orbit, OrbitPath, Shot, ShotPath, View
 
@@ -27,9 +27,12 @@ class CameraPart:
 def camera(t: Table, model: ModelPart) -> CameraPart:
     """The camera from its table; an orbit's defaults follow place and size of the model."""
     view = _shot(t) if t.has("file") else _orbit(t, model)
+    background = t.vector("background", (1.0, 1.0, 1.0), at_least=0)
+    if max(background) > 1:
+        raise t.error("background", "be a list of 3 numbers from 0 to 1")
     return CameraPart(
         view=view,
-        background=t.vector("background", (1.0, 1.0, 1.0)),
+        background=background,
         max_stretch=t.number("max_stretch", 4.0, at_least=1),
     )
 
@@ -136,7 +139,12 @@ def _shot(t: Table) -> Shot | ShotPath:
 
 
 def _width(t: Table, camera: Camera) -> int:
-    return t.integer("width", camera.width, at_least=16, at_most=_LARGEST_IMAGE)
+    width = t.integer("width", camera.width, at_least=16, at_most=_LARGEST_IMAGE)
+    height = _height(camera, width)
+    if max(width, height) > _LARGEST_IMAGE:
+        rule = f"make a picture of at most {_LARGEST_IMAGE} x {_LARGEST_IMAGE}"
+        raise SceneError(f"{t.name}: `width` must {rule}, but it is {width} x {height}.")
+    return width
 
 
 def _one_of(t: Table, cameras: dict[str, Camera]) -> Camera:
@@ -154,9 +162,14 @@ def _one_of(t: Table, cameras: dict[str, Camera]) -> Camera:
     return list(cameras.values())[index]
 
 
+def _height(camera: Camera, width: int) -> int:
+    """The height that goes with another width."""
+    return max(1, round(camera.height * width / camera.width))
+
+
 def _resized(camera: Camera, width: int) -> Camera:
     """The same view in an image of another width; the height follows."""
-    height = max(1, round(camera.height * width / camera.width))
+    height = _height(camera, width)
     across, down = width / camera.width, height / camera.height
     return dataclasses.replace(
         camera,

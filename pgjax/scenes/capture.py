@@ -11,7 +11,7 @@ from pgjax.scenes.interior import filled
 from pgjax.scenes.model import ModelPart, require_files
 from pgjax.scenes.procedural import MODELS
 from pgjax.scenes.reader import SceneError, naming
-from pgjax.scenes.regions import Points
+from pgjax.scenes.regions import Points, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _placing(part: ModelPart, x: np.ndarray) -> Similarity:
 
 def upright(up: np.ndarray) -> np.ndarray:
     """The smallest rotation that takes the direction `up` to +z, `(3, 3)`."""
-    u = up / np.linalg.norm(up)
+    u = unit(up)
     axis, cosine = np.cross(u, [0.0, 0.0, 1.0]), u[2]
     if cosine < -1 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pgjax._files import is_file
 from pgjax.scenes.procedural import MODELS
 from pgjax.scenes.reader import Table, missing_file, nearest
 from pgjax.scenes.regions import AbstractRegion, Triple, region
@@ -111,7 +112,7 @@ def model(t: Table) -> ModelPart:
 
 def require_files(part: ModelPart) -> None:
     """Raise if the file of a captured model is not there."""
-    if part.ply is not None and not part.ply.is_file():
+    if part.ply is not None and not is_file(part.ply):
         raise missing_file(f"{part.label}: `ply`", part.ply)
 
 

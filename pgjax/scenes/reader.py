@@ -2,7 +2,10 @@
 
 import contextlib
 import difflib
+import itertools
 import math
+import os
+import re
 import reprlib
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -11,9 +14,21 @@ from typing import Any, NamedTuple, TypeVar, final
 
 import numpy as np
 
+from pgjax._files import is_file, is_folder, read_text
+
 T = TypeVar("T")
 REQUIRED: Any = object()
 _LARGEST = 2**31 - 1
+# A scene file is short: what is larger, or has deeper keys, would take the parser for ever.
+_LONGEST_FILE, _DEEPEST_KEY = 1 << 20, 100
+_BETWEEN_KEYS = re.compile(r"[=,{}\[\]\n]")
+# Names further from what was meant are not looked at for a hint: how many, how long.
+_MOST_NAMES, _LONGEST_NAME = 1000, 80
+# Longer paths are cut in messages.
+_LONGEST_PATH = 200
+# No separators of any system, nothing that a terminal obeys, not `.` or `..`.
+_FILE_NAME = re.compile(r"(?!\.{1,2}$)[^/\\:\x00-\x1f\x7f]+")
+_LONGEST_FILE_NAME = 200
 # Of a value of any length a message shows as much as fits into a line.
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = 80
@@ -81,8 +96,8 @@ class Table:
         self._known[key] = None
         if key not in self._data and default is REQUIRED:
             others = [k for k in self._data if k not in self._known]
-            misspelt = difflib.get_close_matches(key, others, n=1)
-            hint = f" (is `{misspelt[0]}` meant?)" if misspelt else ""
+            misspelt = _nearest(key, others)
+            hint = f" (is `{misspelt}` meant?)" if misspelt else ""
             raise SceneError(f"{self.name}: `{key}` is missing{hint}.")
         return self._data.get(key, default)
 
@@ -144,9 +159,17 @@ class Table:
     def existing_path(self, key: str) -> Path:
         """A path, relative to the scene file, of a file or folder that is there."""
         path = self.path(key)
-        if not path.exists():
+        if not is_file(path) and not is_folder(path):
             raise missing_file(f"{self.name}: `{key}`", path)
         return path
+
+    def file_name(self, key: str, default: str) -> str:
+        """A string that can name a file or folder in another one, and leads nowhere else."""
+        name = self.text(key, default)
+        if not _FILE_NAME.fullmatch(name) or len(os.fsencode(name)) > _LONGEST_FILE_NAME:
+            rule = f"name a folder, without slashes, in at most {_LONGEST_FILE_NAME} bytes"
+            raise SceneError(f"{self.name}: `{key}` must {rule}, but is {_SHORT.repr(name)}.")
+        return name
 
     def vector(self, key: str, default: Any = REQUIRED, *, size: int = 3, **bounds: float) -> Any:
         """A list of finite numbers in a `Range`."""
@@ -249,18 +272,34 @@ def naming(name: str) -> Iterator[None]:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """The hint at the known name that is most like this one; nothing if none is."""
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f" (did you mean `{close[0]}`?)" if close else ""
+    close = _nearest(name, known)
+    return f" (did you mean `{close}`?)" if close else ""
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """The known name that is most like this one; empty if none is."""
+    if len(name) > _LONGEST_NAME:
+        return ""
+    short = itertools.islice((k for k in known if len(k) <= _LONGEST_NAME), _MOST_NAMES)
+    return next(iter(difflib.get_close_matches(name, list(short), n=1)), "")
 
 
 def missing_file(where: str, path: Path) -> SceneError:
     """The error of a path that names nothing, with the nearest name in its folder."""
-    return SceneError(f"{where} must name a file, but there is no {path}{_neighbour(path)}.")
+    return SceneError(f"{where} must name a file, but there is no {shown(path)}{_neighbour(path)}.")
+
+
+def shown(path: Path) -> str:
+    """A path in a message: its end where it is long, nothing in it that a terminal obeys."""
+    text = str(path)
+    text = text if len(text) <= _LONGEST_PATH else f"…{text[-_LONGEST_PATH:]}"
+    return text if text.isprintable() else repr(text)
 
 
 def _neighbour(path: Path) -> str:
-    others = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-    return nearest(path.name, others)
+    if not is_folder(path.parent):
+        return ""
+    return nearest(path.name, (p.name for p in path.parent.iterdir() if p.name != path.name))
 
 
 def _is_number(value: Any) -> bool:
@@ -282,9 +321,12 @@ def parse(path: Path) -> Table:
 
 def content(path: Path) -> dict[str, Any]:
     """What is written in a TOML file."""
-    if not path.is_file():
-        raise SceneError(f"The scene file {path} does not exist{_neighbour(path)}.")
+    if not is_file(path):
+        raise SceneError(f"The scene file {shown(path)} does not exist{_neighbour(path)}.")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = read_text(path, _LONGEST_FILE)
+        if any(part.count(".") > _DEEPEST_KEY for part in _BETWEEN_KEYS.split(text)):
+            raise ValueError(f"it has a key of more than {_DEEPEST_KEY} parts")
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{path} is not a TOML file: {error}.") from error

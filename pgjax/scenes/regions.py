@@ -6,7 +6,7 @@ A region is closed: points on its faces belong to it.
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -69,11 +69,11 @@ class CylinderRegion(AbstractRegion):
 
     def contains(self, points: Points) -> np.ndarray:
         """Between the ends, and no farther than r from the axis."""
-        axis = np.subtract(self.end, self.start)
-        length = np.linalg.norm(axis)
+        axis = unit(np.subtract(self.end, self.start))
+        length = np.subtract(self.end, self.start) @ axis
         from_start = points.x - np.asarray(self.start)
-        along = from_start @ (axis / length)
-        across = _length(from_start - along[:, None] * (axis / length))
+        along = from_start @ axis
+        across = _length(from_start - along[:, None] * axis)
         return (along >= 0) & (along <= length) & (across <= self.radius)
 
 
@@ -176,6 +176,13 @@ SHAPES = {
     "labels": _labels,
 }
 """The regions by name."""
+
+
+def unit(direction: Any) -> np.ndarray:
+    """The vector of length 1 along a direction that is not zero, however small or large."""
+    v = np.asarray(direction, np.float64)
+    v = v / np.abs(v).max()
+    return v / np.linalg.norm(v)
 
 
 def _length(v: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ def scene_from(root: Table, name: str) -> SceneFile:
 
 
 def _scene(root: Table, name: str) -> SceneFile:
-    name = root.text("name", name)
+    name = root.file_name("name", name)
     models = _models(root)
     forces = root.table("forces", {})
     gravity = forces.vector("gravity", (0.0, 0.0, 0.0))

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pgjax.scenes.reader import Table
-from pgjax.scenes.regions import Triple
+from pgjax.scenes.regions import Triple, unit
 
 
 def rotation(t: Table, key: str = "rotation") -> np.ndarray:
@@ -38,5 +38,6 @@ def _turn(t: Table) -> np.ndarray:
 
 
 def _about(axis: Triple, degrees: float) -> np.ndarray:
-    direction = np.asarray(axis) / np.linalg.norm(axis)
-    return Rotation.from_rotvec(math.radians(degrees) * direction).as_matrix()
+    # Whole turns are left out: of a huge angle nothing but their rounding would be left.
+    angle = math.radians(math.fmod(degrees, 360))
+    return Rotation.from_rotvec(angle * unit(axis)).as_matrix()
