@@ -192,7 +192,7 @@ LAWS = {
 }
 
 
-@pytest.mark.parametrize("what", LAWS)
+@pytest.mark.parametrize("what", ["rubber", pytest.param("sand", marks=pytest.mark.slow)])
 def test_g7_growth_of_impacts(measure, what):
     """What is stated of ordinary scenes: a block thrown on a rough floor, over 0.6 s."""
 

@@ -51,7 +51,7 @@ def apart(x, y):
     return np.sqrt(np.mean(square, axis=-1)).max()
 
 
-@pytest.mark.parametrize("n", [16, 32])
+@pytest.mark.parametrize("n", [pytest.param(16, marks=pytest.mark.slow), 32])
 def test_v43_elastic_wave(measure, monkeypatch, n):
     """V24 in two dimensions: its error, and the motion itself."""
     seen = watched(monkeypatch)
