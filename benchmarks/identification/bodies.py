@@ -45,11 +45,13 @@ class Resolution:
         rng = np.random.default_rng(self.seed)
         return x + rng.uniform(-0.25, 0.25, x.shape) * self.h / 2
 
-    def grid(self, lower, upper) -> pgjax.Grid:
-        """A grid that covers a box, with two cells around it."""
+    def grid(self, lower, upper, above: float = 0.0) -> pgjax.Grid:
+        """A grid that covers a box and two cells around it; last, a node lies `above` 0."""
         lower = np.floor(np.asarray(lower) * self.cells - 2).astype(int)
         upper = np.ceil(np.asarray(upper) * self.cells + 2).astype(int)
-        return pgjax.Grid(tuple(lower * self.h), tuple(int(n) for n in upper - lower), self.h)
+        origin = lower * self.h
+        origin[-1] += above
+        return pgjax.Grid(tuple(origin), tuple(int(n) for n in upper - lower), self.h)
 
 
 def tilted_block(size, center, resolution: Resolution) -> tuple[np.ndarray, np.ndarray]:
