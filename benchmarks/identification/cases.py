@@ -219,9 +219,11 @@ def _tumbling(name, truth, parameters, material_of, targets) -> Case:
         center, edge = np.full(3, 0.5), 0.25
         x, volumes = sampling.block(center - edge / 2, center + edge / 2, resolution.h / 2)
         x = center + resolution.jittered(x - center)
-        grid = resolution.grid((0, 0, 0), (1, 1, 1))
-        # On nodes of this grid and of the finer one.
-        walls = Box((0.1,) * 3, (0.9,) * 3, Separating(0.0))
+        # The walls act at 0.1 and, to 0.2 cells, at 0.9: their nodes are 17 cells apart here.
+        behind = BEHIND * resolution.h
+        grid = pgjax.Grid((-behind,) * 3, (resolution.cells + 2,) * 3, resolution.h)
+        width = (np.round(0.8 * resolution.cells) + 1) * resolution.h
+        walls = Box((0.1 - behind,) * 3, (0.1 - behind + width,) * 3, Separating(0.0))
 
         def of(values):
             scene = pgjax.Scene(
@@ -254,7 +256,10 @@ def _tumbling(name, truth, parameters, material_of, targets) -> Case:
         frames=50,
         frame_dt=1e-2,
         targets={**dict.fromkeys(truth, relative), **targets, "v0": relative, "omega0": relative},
-        stages=(Stage(frames=5, free=("v0", "omega0")), Stage(frames=20)),
+        stages=(
+            Stage(frames=5, free=("v0", "omega0"), keep=True),
+            Stage(frames=20, free=tuple(truth)),
+        ),
         substeps=20,
         double=True,
         trials=15,
