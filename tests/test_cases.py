@@ -218,7 +218,7 @@ def test_bad_data(recorded, tmp_path):
     assert len(whole.footage[0].numbers) == 7
     assert not whole.notes
     wide = VIEW + "[view.camera]\nwidth = 64\nheight = 48\nradius = 1.1\n"
-    with pytest.raises(SceneError, match="64 × 48, but have 48 × 48"):
+    with pytest.raises(SceneError, match=r"64 × 48 pixels, the .* of its camera, but has 48 × 48"):
         prepare(read_case(write(recorded, "wide.toml", data=wide)))
     gap = tmp_path / "gap"
     gap.mkdir()

@@ -3,8 +3,12 @@
 libigl (https://libigl.github.io) is an optional dependency: `pip install "pgjax[mesh]"`.
 """
 
+import contextlib
 import math
 import os
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,12 +17,27 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from pgjax._files import is_file
 from pgjax._types import positive, require
 from pgjax.boundary.shapes import SampledSDF
 
 # Nodes of the lattice: 10⁷ distances to a mesh take about a minute.
 _MOST_NODES = 10_000_000
 _MARGIN = 3  # nodes around the body
+# In a process of its own: a damaged file makes libigl's readers end theirs, or ask for any memory.
+_READER = """
+import os, sys, igl, numpy
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[3]),) * 2)
+except ImportError:
+    pass
+vertices, faces = igl.read_triangle_mesh(sys.argv[1])
+with open(sys.argv[2] + ".part", "wb") as file:
+    numpy.savez(file, vertices=vertices, faces=faces)
+os.replace(sys.argv[2] + ".part", sys.argv[2])
+"""
+_READER_MEMORY, _READER_SECONDS = 2 << 30, 300
 
 
 def sample_mesh(
@@ -103,15 +122,27 @@ def _igl() -> ModuleType:
 
 def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     file = Path(path)
-    if not file.is_file():
+    if not is_file(file):
         raise ValueError(f"The mesh {file} does not exist.")
-    try:
-        vertices, faces = _igl().read_triangle_mesh(str(file))
-    except (RuntimeError, ValueError) as error:
-        if error.__cause__ is not None:
-            raise
-        raise ValueError(f"The file {file} cannot be read as a triangle mesh.") from error
-    return _arrays(vertices, faces, f"The file {file}")
+    _igl()
+    with tempfile.TemporaryDirectory() as folder:
+        found = Path(folder) / "mesh.npz"
+        limit = _READER_MEMORY + 100 * file.stat().st_size
+        command = [
+            sys.executable,
+            "-P",
+            "-c",
+            _READER,
+            str(file.absolute()),
+            str(found),
+            str(limit),
+        ]
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            subprocess.run(command, capture_output=True, check=False, timeout=_READER_SECONDS)
+        if not found.is_file():
+            raise ValueError(f"The file {file} cannot be read as a triangle mesh.")
+        with np.load(found) as arrays:
+            return _arrays(arrays["vertices"], arrays["faces"], f"The file {file}")
 
 
 def _arrays(

@@ -6,12 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from pgjax.cases.unknowns import Unknown, unknown
+from pgjax._files import is_file
+from pgjax.cases.unknowns import Unknown, counted, unknown
 from pgjax.inverse import Stage
 from pgjax.scenes import SceneFile, read_scene, resolve
 from pgjax.scenes.camera import CameraPart, camera
 from pgjax.scenes.reader import Table, content, nearest, parse
 from pgjax.scenes.schema import scene_from
+
+# All that was recorded is held in memory.
+_MOST_FRAMES = 100_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,9 +83,9 @@ def read_case(path: Path, data: Path | None = None) -> CaseFile:
 def _case(t: Table, path: Path, data: Path | None) -> CaseFile:
     scene_name = t.text("scene")
     beside = t.path("scene")
-    scene_path = beside if beside.exists() else resolve(scene_name)
+    scene_path = beside if is_file(beside) else resolve(scene_name)
     scene = read_scene(scene_path)
-    frames = t.integer("frames", scene.time.frames)
+    frames = t.integer("frames", min(scene.time.frames, _MOST_FRAMES), at_most=_MOST_FRAMES)
     fit_frames = t.integer("fit_frames", frames, at_most=frames)
     unknowns = tuple(part.read(unknown) for part in t.tables("unknown", required=True))
     if not unknowns:
@@ -98,7 +102,7 @@ def _case(t: Table, path: Path, data: Path | None) -> CaseFile:
         scene_path=scene_path,
         unknowns=unknowns,
         frame_rate=t.number("frame_rate", scene.time.fps, above=0),
-        first=t.integer("first", 0, at_least=0),
+        first=t.integer("first", 0, at_least=0, at_most=_MOST_FRAMES),
         fit_frames=fit_frames,
         frames=frames,
         channel=channel,
@@ -174,7 +178,7 @@ def _replace(tree: Any, names: list[str], value: Any) -> None:
     """Write a value where a key of the case says; a table of one needs no number."""
     *path, last = names
     for name in path:
-        if name.isdigit():
+        if counted(name) is not None:
             tree = tree[int(name) - 1] if isinstance(tree, list) else tree
             continue
         if isinstance(tree, list):

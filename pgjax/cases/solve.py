@@ -21,7 +21,9 @@ from pgjax.render import Camera
 from pgjax.result import SimulationWarning
 from pgjax.scenes import Plan, SceneError, plan
 from pgjax.scenes.camera import CameraPart
+from pgjax.scenes.reader import naming
 from pgjax.scenes.regions import Triple
+from pgjax.scenes.views import Orbit, Shot
 from pgjax.timestep import substeps_for
 
 # The first pictures are those of the scene at rest up to this: root mean square over the pixels in
@@ -62,18 +64,18 @@ def prepare(case: CaseFile) -> Prepared:
         if case.track is not None:
             observations, films = _of_track(case, made), ()
         else:
+            seen = [part or made.view for _, part in case.views]
+            cameras = [
+                _camera(case, made, part, t.name)
+                for part, (t, _) in zip(seen, case.views, strict=True)
+            ]
             films = tuple(
-                footage(t, case.frame_rate, case.first, case.frames) for t, _ in case.views
+                footage(t, case.frame_rate, case.first, case.frames, (camera.width, camera.height))
+                for camera, (t, _) in zip(cameras, case.views, strict=True)
             )
             observations = [
-                _of_view(
-                    case,
-                    made,
-                    film,
-                    _camera(case, made, part or made.view, t.name),
-                    (part or made.view).background,
-                )
-                for film, (t, part) in zip(films, case.views, strict=True)
+                _of_view(case, made, film, camera, part.background)
+                for film, camera, part in zip(films, cameras, seen, strict=True)
             ]
     for t, _ in case.views:
         t.close()
@@ -98,11 +100,11 @@ def prepare(case: CaseFile) -> Prepared:
 
 def _camera(case: CaseFile, made: Plan, part: CameraPart, label: str) -> Camera:
     """The camera of a view, which has to stand still."""
-    first, *rest = (
-        part.view.at(frame / case.frame_rate, made.to_simulation)
-        for frame in range(case.frames + 1)
-    )
-    for other in rest:
+    with naming(label):
+        first = part.view.at(0.0, made.to_simulation)
+    still = isinstance(part.view, Shot) or (isinstance(part.view, Orbit) and not part.view.turn)
+    for frame in range(1, 1 if still else case.frames + 1):
+        other = part.view.at(frame / case.frame_rate, made.to_simulation)
         pairs = zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True)
         if not all(np.array_equal(a, b) for a, b in pairs):
             raise SceneError(f"{label}: the camera must stand still, but moves between frames.")
@@ -112,13 +114,6 @@ def _camera(case: CaseFile, made: Plan, part: CameraPart, label: str) -> Camera:
 def _of_view(
     case: CaseFile, made: Plan, film: Footage, camera: Camera, background: Triple
 ) -> AbstractObservation:
-    height, width = film.pictures.shape[1:3]
-    if (height, width) != (camera.height, camera.width):
-        raise SceneError(
-            f"{film.label}: the pictures must have the size of the camera, {camera.width} × "
-            f"{camera.height}, but have {width} × {height}: give the camera their `width` and "
-            "`height`."
-        )
     data = film.pictures if case.channel == "rgb" else film.pictures.mean(axis=-1)
     return Pictures(
         made.moving,
@@ -138,14 +133,15 @@ def _of_track(case: CaseFile, made: Plan) -> list[AbstractObservation]:
     kept = found.numbers <= case.frames
     if not kept.any():
         raise case.track.error("file", f"hold frames up to {case.frames}, the last one")
-    return [
-        Positions(
-            found.x[kept],
-            frames=found.numbers[kept].tolist(),
-            particles=found.particles,
-            sigma=case.noise,
-        )
-    ]
+    with naming(case.track.name):
+        return [
+            Positions(
+                found.x[kept],
+                frames=found.numbers[kept].tolist(),
+                particles=found.particles,
+                sigma=case.noise,
+            )
+        ]
 
 
 def _given_steps(case: CaseFile) -> int | None:

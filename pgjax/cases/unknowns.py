@@ -1,6 +1,7 @@
 """The unknowns of a case: which number of the scene file each of them stands for."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, final
 
@@ -81,8 +82,8 @@ def place(unknown: Unknown, plan: Plan) -> Place:
     if group == "forces" and rest:
         found = _of_scene(".".join(rest), unknown, plan)
     elif group in finders and rest:
-        number = int(rest[0]) - 1 if rest[0].isdigit() else None
-        names = rest[1:] if rest[0].isdigit() else rest
+        number = counted(rest[0])
+        names = rest if number is None else rest[1:]
         if not names:
             raise _wrong(unknown, "name a key of the table, as in `material.E`")
         found = finders[group](number, names, unknown, plan)
@@ -95,6 +96,11 @@ def place(unknown: Unknown, plan: Plan) -> Place:
             f"the scene, but has {unknown.parameter.shape}."
         )
     return found
+
+
+def counted(name: str) -> int | None:
+    """The index, from 0, that a part of a key counts from 1; None if it is a name."""
+    return int(name) - 1 if re.fullmatch(r"[0-9]{1,9}", name) else None
 
 
 def _wrong(unknown: Unknown, rule: str) -> SceneError:

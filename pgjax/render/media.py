@@ -13,9 +13,11 @@ import imageio_ffmpeg
 import numpy as np
 from jax.typing import ArrayLike
 
-from pgjax._files import replacing, with_suffix
+from pgjax._files import is_file, replacing, require_memory, with_suffix
 from pgjax._types import require
 
+# Bytes for a pixel: three numbers in double precision.
+_IN_MEMORY = 24
 # Options of the encoder. Colours of .mp4 follow BT.709 and say so, else players guess by the size.
 _ENCODINGS = {
     ".mp4": [
@@ -46,14 +48,42 @@ def save_image(path: str | os.PathLike[str], rgb: ArrayLike) -> None:
         imageio.imwrite(temporary, pixels)
 
 
-def load_image(path: str | os.PathLike[str]) -> np.ndarray:
+def load_image(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
     """An image file as `save_image` takes it: shape (height, width, 3), floating, in [0, 1].
 
     What was read and is written again has the same pixels.
+
+    Args:
+        path: the file.
+        size: width and height of the camera that saw it, compared before anything is unpacked.
+
+    Raises:
+        ValueError: the file is no image, or one of another size.
     """
-    pixels = np.asarray(imageio.imread(Path(path)))
+    file = Path(path)
+    if not is_file(file):
+        raise ValueError(f"There is no file {file}.")
+    try:
+        with file.open("rb") as stream:
+            height, width = imageio.improps(stream, extension=file.suffix).shape[:2]
+            if size is not None and (width, height) != size:
+                raise ValueError(f"it {_as_the_camera(size, (width, height))}")
+            require_memory(file, _IN_MEMORY * width * height)
+        # The reader has closed the first one.
+        with file.open("rb") as stream:
+            pixels = np.asarray(imageio.imread(stream, extension=file.suffix))
+    except Exception as error:  # Whatever is wrong with the file.
+        raise ValueError(f"The file {file} cannot be used as a picture: {error}.") from error
     largest = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
     return pixels.astype(np.float64) / largest
+
+
+def _as_the_camera(wanted: tuple[int, int], found: tuple[int, int]) -> str:
+    """The rule that pictures have the size of their camera."""
+    return (
+        f"must have {wanted[0]} × {wanted[1]} pixels, the `width` and `height` of its camera, but "
+        f"has {found[0]} × {found[1]}"
+    )
 
 
 class Film(NamedTuple):
@@ -70,29 +100,47 @@ class Film(NamedTuple):
     pictures: np.ndarray
 
 
-def load_video(path: str | os.PathLike[str], most: int | None = None) -> Film:
+def load_video(
+    path: str | os.PathLike[str], most: int | None = None, size: tuple[int, int] | None = None
+) -> Film:
     """Read a video, its first `most` frames or all.
 
+    Args:
+        path: the file.
+        most: how many frames are read; all if None.
+        size: width and height of the camera that saw it, compared before anything is unpacked.
+
     Raises:
-        ValueError: the file is not a video, or cannot be decoded.
+        ValueError: the file is not a video, cannot be decoded, or has another size.
     """
     file = Path(path)
-    if not file.is_file():
+    if not is_file(file):
         raise ValueError(f"Argument `path` must name a file, but there is no {file}.")
     limit = [] if most is None else ["-frames:v", str(most)]
     # Its header has size and rate in numbers, `YUV4MPEG2 W640 H480 F25:1 …`.
     header = _decoded(file, ["-frames:v", "1", "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe"])
-    words = header.partition(b"\n")[0].decode("ascii", "replace").split()
-    facts = {word[:1]: word[1:] for word in words[1:]}
-    width, height = int(facts["W"]), int(facts["H"])
-    number, _, by = facts["F"].partition(":")
-    rate = int(number) / int(by)
+    width, height, rate = _facts(file, header)
+    if size is not None and (width, height) != size:
+        raise ValueError(f"The file {file} {_as_the_camera(size, (width, height))}.")
     # As they are stored: ffmpeg would fill a gap with copies.
     each = ["-fps_mode", "passthrough"]
     raw = _decoded(file, [*limit, *each, "-f", "rawvideo", "-pix_fmt", "rgb24"])
+    if len(raw) % (3 * width * height):
+        raise ValueError(f"The file {file} must have frames of one size, but has others.")
     pictures = np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
     seconds = _times(_decoded(file, [*limit, *each, "-f", "framecrc"]).decode("ascii", "replace"))
     return Film(rate, np.round((seconds - seconds[0]) * rate).astype(int), pictures)
+
+
+def _facts(file: Path, header: bytes) -> tuple[int, int, float]:
+    """Width, height and frames per second from the first line of a YUV4MPEG2."""
+    words = header.partition(b"\n")[0].decode("ascii", "replace").split()
+    facts = {word[:1]: word[1:] for word in words[1:]}
+    try:
+        number, _, by = facts["F"].partition(":")
+        return int(facts["W"]), int(facts["H"]), int(number) / int(by)
+    except (KeyError, ValueError, ZeroDivisionError):
+        raise ValueError(f"The file {file} does not say its size and frame rate.") from None
 
 
 def _times(listing: str) -> np.ndarray:
@@ -106,7 +154,9 @@ def _times(listing: str) -> np.ndarray:
 
 def _decoded(file: Path, options: list[str]) -> bytes:
     """What ffmpeg makes of a video."""
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(file)]
+    # A playlist may name what it likes: nothing is fetched from elsewhere.
+    local = ["-protocol_whitelist", "file,pipe"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", *local, "-i", str(file)]
     done = subprocess.run(
         [*command, "-map", "0:v:0", *options, "-"],
         stdin=subprocess.DEVNULL,

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from pgjax._files import is_file, is_folder
 from pgjax.scenes.build import PRESETS as PRESETS
 from pgjax.scenes.build import Plan as Plan
 from pgjax.scenes.build import plan as plan
@@ -16,10 +17,10 @@ from pgjax.scenes.summary import summary as summary
 def resolve(name: str) -> Path:
     """The scene file behind the name of a preset or a path."""
     preset = PRESETS / f"{name}.toml"
-    if preset.is_file():
+    if is_file(preset):
         return preset
     path = Path(name)
-    if path.suffix != ".toml" and not path.exists():
+    if path.suffix != ".toml" and not is_file(path) and not is_folder(path):
         raise SceneError(
             f"There is no preset `{name}` (there are {', '.join(presets())}) and no such file."
         )
