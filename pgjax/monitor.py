@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 
 from pgjax._types import Array, Bool, Float, Matrix3, Scalar
-from pgjax.models.elasticity import principal_stretches
 from pgjax.models.material import cast, particle_axes
+from pgjax.models.strain import principal_stretches
 from pgjax.result import Condition
 from pgjax.scene import Scene
 from pgjax.state import State

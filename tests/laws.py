@@ -12,7 +12,7 @@ import numpy as np
 
 import pgjax.models as pm
 import pgjax.models.reference as svd
-from pgjax.models.elasticity import volume_change
+from pgjax.linalg import volume_change
 from pgjax.models.material import cast
 
 E, NU, DT = 7.0, 0.3, 0.01

@@ -25,7 +25,7 @@ from pgjax.inverse import (
     gradient_check,
 )
 from pgjax.inverse.levenberg import evaluate
-from pgjax.models.elasticity import hencky_strain
+from pgjax.models.strain import hencky_strain
 from pgjax.render import Camera, Gaussians
 
 float64 = pytest.mark.float64

@@ -3,122 +3,34 @@
 Every law is isotropic, so none needs more than the eigenvectors of `B = F Fᵀ − I`, and neither
 neo-Hookean law needs even those. Working from H instead of F keeps the stress accurate to
 rounding at every strain: from F, float32 loses digits as 1e-7/strain.
+
+What is turned inside out stays so: a stable step multiplies F by a matrix of positive determinant.
+Fixed corotated elasticity draws it towards det F = 0. The other laws know F by `F Fᵀ` alone: there
+it is as its mirror image, at rest as that, with the same energy and the same stable time step. It
+is counted (INVERTED) as long as it lasts.
 """
 
 from collections.abc import Callable
 from typing import final
 
-import jax
 import jax.numpy as jnp
 
 from pgjax._types import Array, Matrix3, Scalar, Vector3, parameter
-from pgjax.linalg import deviator, eigenbasis, spectral_map
-from pgjax.linalg import volume_change as volume_change
+from pgjax.linalg import deviator, volume_change
 from pgjax.models.law import AbstractElasticity, Response
+from pgjax.models.strain import (
+    SMALLEST_STRETCH,
+    SMALLEST_VOLUME_RATIO,
+    hencky_strain,
+    identity,
+    isochoric_strain,
+    left_strain,
+    log_volume,
+    principal_stretches,
+    stretch_minus_identity,
+    volume_potentials,
+)
 from pgjax.native.particles import per_particle
-
-# Below these, logarithms are continued (module docstring of each law says how), so that a
-# crushed or inverted particle is pushed back instead of turning into NaN.
-SMALLEST_STRETCH = 1e-4
-SMALLEST_VOLUME_RATIO = 1e-2
-
-
-def identity(like: Matrix3) -> Matrix3:
-    """The 3×3 identity in the dtype of `like`."""
-    return jnp.eye(3, dtype=like.dtype)
-
-
-def left_strain(H: Matrix3) -> Matrix3:
-    """`B = F Fᵀ − I = H + Hᵀ + H Hᵀ`, without the cancellation of forming F."""
-    return H + H.T + H @ H.T
-
-
-def log_volume(H: Matrix3) -> tuple[Scalar, Scalar]:
-    """`log J` and `J`, continued by its tangent below `J = 1e-2`.
-
-    The continuation keeps growing, so the pressure resists being crushed further. What is inverted
-    stays so, and is counted: a stable step multiplies F by a matrix of positive determinant.
-    """
-    change = volume_change(H)
-    J = 1 + change
-    regular = J > SMALLEST_VOLUME_RATIO
-    logarithm = jnp.log1p(jnp.where(regular, change, 0))
-    at = jnp.asarray(SMALLEST_VOLUME_RATIO, H.dtype)
-    return jnp.where(regular, logarithm, jnp.log(at) + (J - at) / at), J
-
-
-def principal_stretches(H: Matrix3) -> tuple[Vector3, Vector3, Matrix3]:
-    """Signed principal stretches, eigenvalues of `B = F Fᵀ − I` and their basis; no derivative.
-
-    Squaring loses the smallest stretch in float32, so below about 0.3 it is taken from
-    `J/(σ₁σ₂)`, which also gives it the sign of det F.
-
-    Returns:
-        `σ (3,)` largest first, `w = σ² − 1`, `Q (3, 3)` whose columns are the directions.
-    """
-    H = jax.lax.stop_gradient(H)
-    w, Q = eigenbasis(left_strain(H))
-    sigma = jnp.sqrt(jnp.maximum(1 + w, 0))
-    product = sigma[0] * sigma[1]
-    J = 1 + volume_change(H)
-    from_J = J / jnp.where(product > 0, product, 1)
-    small = (sigma[2] < 0.3) | (J < 0)
-    last = jnp.where(small, from_J, sigma[2])
-    sigma = sigma.at[2].set(last)
-    w = w.at[2].set(jnp.where(small, last * last - 1, w[2]))
-    return sigma, w, Q
-
-
-def _log_divided(sigma: Vector3, w: Vector3) -> Matrix3:
-    """Divided differences of `log σ²` over `w = σ² − 1`, with σ continued as in `hencky_strain`."""
-    square = jnp.maximum(sigma, SMALLEST_STRETCH) ** 2
-    inside = sigma > SMALLEST_STRETCH
-    # w is accurate near 0, σ² far below: their differences are taken from the better one.
-    both_small = (w[:, None] < -0.5) & (w[None, :] < -0.5)
-    kept = jnp.where(inside, w, square - 1)
-    change = jnp.where(both_small, _difference(square), _difference(kept))
-    gap = jnp.where(both_small, _difference(jnp.where(inside, square, 0)), _difference(w))
-    tangent = jnp.where(inside, 1 / square, 0)[:, None] * jnp.ones_like(gap)
-    ratio = change / square[None, :]
-    near = jnp.abs(ratio) < 0.5
-    logarithm = jnp.log1p(jnp.where(near, ratio, 0))
-    logarithm = jnp.where(near, logarithm, _difference(jnp.log(square)))
-    return jnp.where(gap == 0, tangent, logarithm / jnp.where(gap == 0, 1, gap))
-
-
-def _difference(a: Vector3) -> Matrix3:
-    return a[:, None] - a[None, :]
-
-
-def hencky_strain(H: Matrix3) -> tuple[Matrix3, Matrix3]:
-    """Hencky strain `ε = ½ log(F Fᵀ)` as a tensor with its exact derivative, and its basis.
-
-    Stretches below 1e-4 (and inverted ones) count as 1e-4; the status reports CLAMPED.
-
-    Returns:
-        `eps (3, 3)` and `Q (3, 3)`, the directions both `eps` and `F Fᵀ` share.
-    """
-    sigma, w, Q = principal_stretches(H)
-    # An inverted direction counts as fully compressed, not by its squared stretch.
-    w = jnp.where(sigma < SMALLEST_STRETCH, -1, w)
-    # Near 1 from w, which is exact there; far below from σ: 1e-8 − 1 is −1 in float32.
-    near = jnp.log1p(jnp.maximum(w, -0.5)) / 2
-    values = jnp.where(w > -0.5, near, jnp.log(jnp.maximum(sigma, SMALLEST_STRETCH)))
-    return spectral_map(left_strain(H), Q, values, _log_divided(sigma, w) / 2), Q
-
-
-def stretch_minus_identity(H: Matrix3) -> Matrix3:
-    """`V − I` of the left polar decomposition `F = V R`, R a rotation also where det F ≤ 0.
-
-    `V − I = Q diag(w/(1 + σ)) Qᵀ`; divided differences of the square root: `1/(σ_i + σ_j)`.
-    """
-    sigma, w, Q = principal_stretches(H)
-    total = sigma[:, None] + sigma[None, :]
-    # σ_i + σ_j vanishes where R itself has no derivative: bounded there, finite everywhere.
-    least = jnp.asarray(jnp.finfo(H.dtype).eps, H.dtype) * jnp.maximum(sigma[0], 1e-6)
-    divided = jnp.where(total < 0, -1, 1) / jnp.maximum(jnp.abs(total), least)
-    values = jnp.where(sigma > 0, w / (1 + jnp.maximum(sigma, 0)), sigma - 1)
-    return spectral_map(left_strain(H), Q, values, divided)
 
 
 def _fixed_corotated_stress(H: Matrix3, mu: Scalar, lam: Scalar) -> tuple[Matrix3, Scalar]:
@@ -220,8 +132,8 @@ class FixedCorotated(AbstractElasticity):
 class StVKHencky(AbstractElasticity):
     """Saint Venant–Kirchhoff elasticity in the Hencky strain: `τ = 2μ ε + λ tr(ε) I`.
 
-    Principal stretches below 1e-4 count as 1e-4 (status CLAMPED). The acoustic modulus
-    `2μ + λ − τ_i` vanishes at a stretch of e = 2.718 (status ELLIPTICITY_LOST).
+    Principal stretches below 1e-4 count as 1e-4 (status CLAMPED): that stress has no energy. The
+    acoustic modulus `2μ + λ − τ_i` vanishes at a stretch of e = 2.718 (status ELLIPTICITY_LOST).
 
     Args:
         E: Young's modulus, Pa. One value or one per particle.
@@ -245,7 +157,7 @@ class StVKHencky(AbstractElasticity):
         return _stvk_hencky_response(H, self.mu, self.lam)
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
-        """`μ ‖ε‖² + λ/2 tr²(ε)`, J/m³ of rest volume."""
+        """`μ ‖ε‖² + λ/2 tr²(ε)`, J/m³ of rest volume (stretches above 1e-4)."""
         del history
         eps, _ = hencky_strain(H)
         return self.mu * jnp.sum(eps * eps) + self.lam / 2 * jnp.trace(eps) ** 2
@@ -253,11 +165,11 @@ class StVKHencky(AbstractElasticity):
     def _principal(self, H: Matrix3) -> tuple[Vector3, Vector3]:
         """Principal Hencky strains and Kirchhoff stresses; no derivative."""
         sigma, _, _ = principal_stretches(H)
-        e = jnp.log(jnp.maximum(sigma, SMALLEST_STRETCH))
+        e = jnp.log(jnp.maximum(jnp.abs(sigma), SMALLEST_STRETCH))
         return e, 2 * self.mu * e + self.lam * jnp.sum(e)
 
     def clamped(self, H: Matrix3, history: Array | None = None) -> Array:
-        """Whether a principal stretch is below 1e-4."""
+        """Whether a principal stretch is below 1e-4, as that of what is inverted."""
         del history
         sigma, _, _ = principal_stretches(H)
         return sigma[2] < SMALLEST_STRETCH
@@ -282,7 +194,7 @@ class StVKHencky(AbstractElasticity):
 class NeoHookean(AbstractElasticity):
     """Neo-Hookean elasticity: `τ = μ (F Fᵀ − I) + λ log J I`; no decomposition.
 
-    Below J = 1e-2 the logarithm continues as its tangent, so an inverted particle is pushed back.
+    Below |J| = 1e-2 the logarithm continues as its tangent (status CLAMPED).
 
     Args:
         E: Young's modulus, Pa. One value or one per particle.
@@ -306,10 +218,10 @@ class NeoHookean(AbstractElasticity):
         return _neo_hookean_response(H, self.mu, self.lam)
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
-        """`μ/2 (tr B − 2 log J) + λ/2 log²J`, J/m³ of rest volume (J > 0.01)."""
+        """`μ/2 (tr B − 2 log J) + λ/2 log²J`, J/m³; that of the stress unless J is rounding."""
         del history
-        log_J, _ = log_volume(H)
-        return self.mu * (jnp.trace(left_strain(H)) / 2 - log_J) + self.lam / 2 * log_J**2
+        logarithm, square = volume_potentials(H)
+        return self.mu * (jnp.trace(left_strain(H)) / 2 - logarithm) + self.lam * square
 
     def clamped(self, H: Matrix3, history: Array | None = None) -> Array:
         """Whether the volume ratio is below 1e-2."""
@@ -324,7 +236,7 @@ class NeoHookean(AbstractElasticity):
         del history
         log_J, J = log_volume(H)
         sigma, _, _ = principal_stretches(H)
-        # d(log J)/d(log J) is 1; the continuation below J = 1e-2 has slope J/0.01.
+        # d(log J)/d(log J) is 1; the continuation below |J| = 1e-2 has slope |J|/0.01.
         slope = jnp.where(J > SMALLEST_VOLUME_RATIO, 1, J / SMALLEST_VOLUME_RATIO)
         c = self.mu - self.lam * log_J
         spread = jnp.maximum(c + dimension * self.lam * slope, jnp.abs(c))
@@ -335,8 +247,9 @@ class NeoHookean(AbstractElasticity):
 class DevVolNeoHookean(AbstractElasticity):
     """Neo-Hookean elasticity split in deviatoric and volumetric parts (Yue et al. 2015).
 
-    `τ = κ/2 (J² − 1) I + μ dev(J^(−2/3) F Fᵀ)`; no decomposition. Below J = 1e-2 the factor
-    `J^(−2/3)` keeps its value at 1e-2, so the law is finite for every F.
+    `τ = κ/2 (J² − 1) I + μ dev(J^(−2/3) F Fᵀ)`; no decomposition. Below |J| = 1e-2 the factor
+    `|J|^(−2/3)` keeps its value at 1e-2, so the law is finite for every F; that stress has no
+    energy.
 
     Args:
         E: Young's modulus, Pa. One value or one per particle.
@@ -354,11 +267,11 @@ class DevVolNeoHookean(AbstractElasticity):
         return pressure * identity(H) + self.mu * deviator(isochoric_strain(H))
 
     def energy(self, H: Matrix3, history: Array | None = None) -> Scalar:
-        """`κ/2 ((J² − 1)/2 − log J) + μ/2 (tr b̄ − 3)`, J/m³ of rest volume (J > 0.01)."""
+        """`κ/2 ((J² − 1)/2 − log J) + μ/2 (tr b̄ − 3)`, J/m³ of rest volume (|J| > 0.01)."""
         del history
-        log_J, _ = log_volume(H)
+        logarithm, _ = volume_potentials(H)
         change = volume_change(H)
-        bulk = self.kappa / 2 * (change * (2 + change) / 2 - log_J)
+        bulk = self.kappa / 2 * (change * (2 + change) / 2 - logarithm)
         return bulk + self.mu / 2 * jnp.trace(isochoric_strain(H))
 
     def clamped(self, H: Matrix3, history: Array | None = None) -> Array:
@@ -382,11 +295,3 @@ class DevVolNeoHookean(AbstractElasticity):
         k = self.kappa * J * J - 2 / 3 * self.mu * t
         spread = jnp.maximum(c + dimension * k, jnp.abs(c))
         return self.mu * (t + ((2 / 3) ** 0.5 + 2 / 3**0.5) * shear) + spread
-
-
-def isochoric_strain(H: Matrix3) -> Matrix3:
-    """`b̄ − I` with `b̄ = J^(−2/3) F Fᵀ`, without cancellation at small strain."""
-    change = jnp.maximum(volume_change(H), SMALLEST_VOLUME_RATIO - 1)
-    factor = jnp.expm1(-2 / 3 * jnp.log1p(change))
-    B = left_strain(H)
-    return B + factor * (B + identity(H))

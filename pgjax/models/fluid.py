@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from pgjax._types import Array, Matrix3, Scalar, parameter, require
-from pgjax.linalg import deviator
-from pgjax.models.elasticity import SMALLEST_VOLUME_RATIO, identity, volume_change
+from pgjax.linalg import deviator, volume_change
 from pgjax.models.law import AbstractLaw
 from pgjax.models.plasticity import AbstractPlasticity
+from pgjax.models.strain import SMALLEST_VOLUME_RATIO, identity
 from pgjax.models.viscous import positive_volume, require_viscosity, strain_rate
 
 

@@ -26,11 +26,9 @@ from pgjax._types import (
     require,
 )
 from pgjax.linalg import cofactor, deviator, spectral_map, volume_change
-from pgjax.models.elasticity import (
+from pgjax.models.elasticity import AbstractElasticity, DevVolNeoHookean, StVKHencky
+from pgjax.models.strain import (
     SMALLEST_VOLUME_RATIO,
-    AbstractElasticity,
-    DevVolNeoHookean,
-    StVKHencky,
     hencky_strain,
     identity,
     isochoric_strain,

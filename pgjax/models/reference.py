@@ -16,16 +16,9 @@ import jax.numpy as jnp
 from pgjax._safe import safe_divide, safe_norm
 from pgjax._types import Array, Bool, Matrix3, Scalar, Vector3, parameter
 from pgjax.linalg import det, isotropic, polar, svd
-from pgjax.models.elasticity import (
-    SMALLEST_STRETCH,
-    SMALLEST_VOLUME_RATIO,
-    AbstractElasticity,
-    DevVolNeoHookean,
-    FixedCorotated,
-    StVKHencky,
-    identity,
-)
+from pgjax.models.elasticity import AbstractElasticity, DevVolNeoHookean, FixedCorotated, StVKHencky
 from pgjax.models.plasticity import AbstractPlasticity, DruckerPrager, HerschelBulkley, VonMises
+from pgjax.models.strain import SMALLEST_STRETCH, SMALLEST_VOLUME_RATIO, identity
 
 _ROOT_2_3 = (2 / 3) ** 0.5
 
@@ -40,8 +33,8 @@ def _singular_values(F: Matrix3) -> Vector3:
 
 
 def _hencky(sigma: Vector3) -> Vector3:
-    """Principal Hencky strains `log σ`; stretches below 1e-4, also inverted ones, count as 1e-4."""
-    return jnp.log(jnp.maximum(sigma, SMALLEST_STRETCH))
+    """Principal Hencky strains `log |σ|`; stretches below 1e-4 count as 1e-4."""
+    return jnp.log(jnp.maximum(jnp.abs(sigma), SMALLEST_STRETCH))
 
 
 @final

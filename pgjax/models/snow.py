@@ -7,16 +7,11 @@ import jax
 import jax.numpy as jnp
 
 from pgjax._types import Array, Matrix3, Scalar, Vector3, nonnegative, parameter, require
-from pgjax.linalg import spectral_map
-from pgjax.models.elasticity import (
-    SMALLEST_STRETCH,
-    FixedCorotated,
-    left_strain,
-    principal_stretches,
-    volume_change,
-)
+from pgjax.linalg import spectral_map, volume_change
+from pgjax.models.elasticity import FixedCorotated
 from pgjax.models.law import AbstractElasticity, AbstractLaw
 from pgjax.models.plasticity import AbstractPlasticity
+from pgjax.models.strain import SMALLEST_STRETCH, left_strain, principal_stretches
 
 # e⁴ = 55 times the stiffness at rest, reached at J_p = 0.6 for ξ = 10; the time step has to bear
 # it, and without an end a crushed particle would be up to e^ξ times as stiff.

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from pgjax._types import Array, Matrix3, Scalar, nonnegative, parameter, require
-from pgjax.models.elasticity import SMALLEST_VOLUME_RATIO, volume_change
+from pgjax.linalg import volume_change
 from pgjax.models.law import AbstractElasticity, AbstractLaw
+from pgjax.models.strain import SMALLEST_VOLUME_RATIO
 
 
 def positive_volume(H: Matrix3) -> Scalar:

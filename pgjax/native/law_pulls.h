@@ -75,12 +75,14 @@ inline void pull_neo_hookean(const V* in, const V* bar, V* out) {
   V b[6], s[6], scaled[6];
   left_strain(in, b);
   symmetric_part(bar, s);
-  const V change = volume_change(in), J = 1 + change, trace = s[0] + s[1] + s[2];
+  const V change = volume_change(in), size = mirrored(change), J = 1 + size;
+  const V trace = s[0] + s[1] + s[2];
   const T at = T(kSmallestVolumeRatio);
   const auto regular = J > at;
-  const V inside = regular ? change : zero;
+  const V inside = regular ? size : zero;
   const V log_J = regular ? log(1 + inside, inside) : T(std::log(at)) + (J - at) / at;
-  const V slope = regular ? 1 / (1 + inside) : zero + 1 / at;
+  const V steep = regular ? 1 / (1 + inside) : zero + 1 / at;
+  const V slope = change < -1 ? -steep : steep;
   for (int e = 0; e < 9; ++e) out[e] = zero;
   for (int e = 0; e < 6; ++e) scaled[e] = mu * s[e];
   pull_strain(scaled, in, out);
@@ -118,17 +120,18 @@ inline void pull_fixed_corotated(const V* in, const V* bar, V* out) {
   out[9] = 2 * double_dot(s, b), out[10] = trace * (1 + change) * change;
 }
 
-// Divided differences of the Hencky strain over w (`_log_divided` / 2 in elasticity.py).
+// Divided differences of the Hencky strain over w (`_log_divided` / 2 in strain.py).
 template <class V>
 inline void log_divided(const Stretches<V>& s, V k[6]) {
   using T = NumberOf<V>;
   const V zero = {}, one = zero + 1, floor = zero + T(kSmallestStretch);
   V square[3], w[3], kept[3], inside_square[3], slope[3];
   for (int i = 0; i < 3; ++i) {
-    const V sigma = at_least(s.sigma[i], floor);
-    const auto inside = s.sigma[i] > floor;
+    const V stretch = s.sigma[i] < 0 ? -s.sigma[i] : s.sigma[i];
+    const V sigma = at_least(stretch, floor);
+    const auto inside = stretch > floor;
     square[i] = sigma * sigma;
-    w[i] = s.sigma[i] < floor ? -one : s.w[i];
+    w[i] = s.w[i];
     kept[i] = inside ? w[i] : square[i] - 1;
     inside_square[i] = inside ? square[i] : zero;
     slope[i] = inside ? one / square[i] : zero;

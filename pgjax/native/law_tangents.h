@@ -34,12 +34,13 @@ inline void tangent_neo_hookean(const V* in, const V* din, V* out) {
   V b[6], db[6];
   left_strain(in, b);
   strain_tangent(in, din, db);
-  const V change = volume_change(in), J = 1 + change;
+  const V change = volume_change(in), size = mirrored(change), J = 1 + size;
   const T at = T(kSmallestVolumeRatio);
   const auto regular = J > at;
-  const V inside = regular ? change : zero;
+  const V inside = regular ? size : zero;
   const V log_J = regular ? log(1 + inside, inside) : T(std::log(at)) + (J - at) / at;
-  const V slope = regular ? 1 / (1 + inside) : zero + 1 / at;
+  const V steep = regular ? 1 / (1 + inside) : zero + 1 / at;
+  const V slope = change < -1 ? -steep : steep;
   for (int e = 0; e < 6; ++e) db[e] = dmu * b[e] + mu * db[e];
   const V pressure = dlam * log_J + lam * slope * volume_tangent(in, din);
   for (int e = 0; e < 3; ++e) db[e] += pressure;

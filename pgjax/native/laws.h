@@ -1,5 +1,6 @@
 // Constitutive laws and return mappings of a group of particles: the formulas of
-// `pgjax/models/elasticity.py` and `plasticity.py`, which are the reference and have the derivatives.
+// `pgjax/models/strain.py`, `elasticity.py` and `plasticity.py`, which are the reference and have the
+// derivatives.
 //
 // A matrix is nine vectors in rows. H = F - I.
 #pragma once
@@ -91,6 +92,12 @@ inline V volume_change(const V* h) {
   return trace + second + third;
 }
 
+// |J| - 1, from J - 1.
+template <class V>
+inline V mirrored(V change) {
+  return change < -1 ? -2 - change : change;
+}
+
 template <class V>
 inline void put_symmetric(const V s[6], V* out) {
   out[0] = s[0], out[4] = s[1], out[8] = s[2];
@@ -116,7 +123,7 @@ struct Stretches {
   V sigma[3], w[3], q[9];  // signed, largest first; w = sigma^2 - 1; directions in columns
 };
 
-// `principal_stretches` in elasticity.py.
+// `principal_stretches` in strain.py.
 template <class V>
 inline Stretches<V> principal_stretches(const V b[6], V change) {
   const V zero = {}, one = zero + 1;
@@ -137,8 +144,7 @@ inline void log_stretches(const Stretches<V>& s, V e[3]) {
   using T = NumberOf<V>;
   const V least = V{} + T(kSmallestStretch);
   for (int i = 0; i < 3; ++i) {
-    const V w = s.sigma[i] < least ? V{} - 1 : s.w[i];
-    const V sigma = at_least(s.sigma[i], least);
+    const V w = s.w[i], sigma = at_least(s.sigma[i] < 0 ? -s.sigma[i] : s.sigma[i], least);
     // Near 1 from w, which is exact there; far below from sigma.
     const auto near = w > T(-0.5);
     const V logarithm = log(near ? 1 + w : sigma, near ? w : sigma - 1);
@@ -153,11 +159,11 @@ inline void neo_hookean(const V* in, V* out) {
   const V mu = in[9], lam = in[10], zero = {};
   V b[6];
   left_strain(in, b);
-  const V change = volume_change(in), J = 1 + change;
+  const V change = volume_change(in), size = mirrored(change), J = 1 + size;
   // Continued by its tangent, as `log_volume` does.
   const T at = T(kSmallestVolumeRatio);
   const auto regular = J > at;
-  const V inside = regular ? change : zero;
+  const V inside = regular ? size : zero;
   const V log_J = regular ? log(1 + inside, inside) : T(std::log(at)) + (J - at) / at;
   for (int i = 0; i < 6; ++i) b[i] *= mu;
   for (int i = 0; i < 3; ++i) b[i] += lam * log_J;

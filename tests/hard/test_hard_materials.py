@@ -114,6 +114,50 @@ def test_h12_a_beam_that_hardly_changes_its_volume(cells, expected, holds):
     holds("H12", material="FixedCorotated")
 
 
+# --- Inverted and crushed ------------------------------------------------------------------------
+
+
+def inverted_states(last):
+    """F with these smallest stretches, each and its mirror image, turned."""
+    stretches = [[1.3, 0.9, sign * s] for s in last for sign in (1, -1)]
+    return laws.with_stretches(np.random.default_rng(3), np.array(stretches))
+
+
+@pytest.mark.parametrize("name", ["NeoHookean", "StVKHencky", "StVKHenckySVD", "DevVolNeoHookean"])
+def test_h01_inverted_states_are_mirror_images(name, holds):
+    """`F Fᵀ` has no sign: the same stress, and none where the image is at rest."""
+    F = np.concatenate([inverted_states([0.5, 0.02]), laws.I3[None]])
+    rounding = 1e4 * float(jnp.finfo(jnp.zeros(()).dtype).eps)
+    _, _, tau = laws.run(name, np.concatenate([F, F @ np.diag([1.0, 1.0, -1.0])]))
+    assert laws.norm(tau[:5] - tau[5:]).max() < rounding * laws.E
+    assert laws.norm(tau[9]) < rounding * laws.E
+    holds("H01", material=name)
+
+
+ENERGIES = {
+    "FixedCorotated": 0.0,
+    "NeoHookean": 0.0,
+    "StVKHencky": 1e-4,
+    "StVKHenckySVD": 1e-4,
+    "DevVolNeoHookean": 1e-2,
+}
+
+
+@pytest.mark.float64
+@pytest.mark.parametrize("name", ENERGIES)
+def test_h01_stress_of_inverted_and_crushed_states_is_that_of_the_energy(name, holds):
+    """`τ = ∂W/∂F Fᵀ`, down to the stretch or volume below which a stress has no energy."""
+    last = [s for s in (0.6, 0.05, 4e-3, 2e-4, 1e-6) if s > ENERGIES[name]]
+    F, law = inverted_states(last), laws.LAWS[name].material.elasticity
+    strain = jnp.asarray(F - laws.I3)
+    P = np.asarray(jax.jit(jax.vmap(jax.grad(law.energy)))(strain))
+    tau = np.asarray(jax.jit(jax.vmap(lambda A: law.kirchhoff(A, A)))(strain))
+    error = laws.norm(P @ F.swapaxes(1, 2) - tau) / laws.norm(tau)
+    # What so small a stretch keeps of its digits.
+    assert (error * np.repeat(last, 2) < 1e-12).all()
+    holds("H01", material=name, precision="float64")
+
+
 # --- Limits of flow -------------------------------------------------------------------------------
 
 STRAINS = {

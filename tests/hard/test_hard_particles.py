@@ -84,16 +84,27 @@ def energies(scene, state):
 @every_material
 @pytest.mark.parametrize("stretch", [(1.0, -0.5, 1.0), (-0.9, 1.2, 1.0)], ids=str)
 def test_h01_inverted(name, stretch, holds):
-    """Turned inside out among sound neighbours: counted in every step that it stays so.
+    """Turned inside out among sound neighbours: harmless, counted in every step that it stays so.
 
     `F ← (I + Δt L) F` changes the sign of det F only where det(I + Δt L) < 0, which no stable
-    step reaches: what is inverted stays inverted, whatever its stress.
+    step reaches: what is inverted stays inverted, whatever its stress. That of fixed corotated
+    elasticity draws it towards det F = 0, that of the others is that of its mirror image.
+
+    An energy that is continued through det F = 0, so that it pushes back, is worse. Continued by a
+    parabola below J = 0.01, neo-Hookean elasticity has at J = −0.5 a stable step 48 times shorter,
+    and at that of the others all 36 particles are lost; a block that hits the floor at ten times
+    the speed of sound stays crushed at J = 4e-16, since Kirchhoff stress vanishes with J.
     """
-    _, end, _ = survives(name, np.diag(stretch))
-    assert int(end.status.first[Condition.INVERTED]) == 0
-    lost = int(jnp.minimum(*end.status.first[:2]))
-    assert int(end.status.count[Condition.INVERTED]) >= min(lost, 200)
-    assert volume_ratio(end) < 0
+    scene, state, _ = deformed(name, np.diag(stretch))
+    assert is_finite(slopes(scene, state, pgjax.stable_dt(scene, state)))
+    before = sum(energies(scene, state))
+    end = run(scene, state, pgjax.stable_dt(scene, state), 400)
+    assert is_finite(end)
+    # Sand that nothing holds together flies apart.
+    assert bool(end.status.ok) or name == "sand"
+    assert sum(energies(scene, end)) < 1.001 * before
+    assert int(end.status.count[Condition.INVERTED]) == 400 or not bool(end.alive[ODD])
+    assert -1.5 < volume_ratio(end) < 0
     holds("H01", material=name, outcome=conditions(end))
 
 
