@@ -1,8 +1,10 @@
-"""Particles: lattices that fill simple shapes, and the rest volumes of captured points."""
+"""Particles: lattices that fill simple shapes, volumes of captured points, pieces of bodies."""
 
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from pgjax._types import require
@@ -50,6 +52,30 @@ def ball(center: Any, radius: float, spacing: float) -> tuple[np.ndarray, np.nda
     x = x[np.sum((x - middle) ** 2, axis=1) <= radius**2]
     exact = np.pi * radius**2 if len(middle) == 2 else 4 / 3 * np.pi * radius**3
     return x, np.full(len(x), exact / len(x))
+
+
+def pieces(x: Any, reach: float) -> np.ndarray:
+    """Which piece of a body each particle belongs to: particles within reach of each other are one.
+
+    A grid tears a body where neighbours are further apart than its spacing h, whatever the law:
+    with `reach = h` more pieces than at the start mean that it did. A valid motion goes on from
+    there; whether the body should have torn is for a finer grid, or more particles, to say.
+
+    Args:
+        x: positions, `(p, d)`, finite: `trajectory.saved.x[frame]`.
+        reach: m.
+
+    Returns:
+        Numbers of pieces `(p,)`, the largest piece being 0; `max() + 1` is how many there are.
+    """
+    points = np.asarray(x, np.float64)
+    require("x", points, "be finite", np.isfinite)
+    require("reach", reach, "be positive and finite (m)", lambda a: (a > 0) & np.isfinite(a))
+    a, b = KDTree(points).query_pairs(reach, output_type="ndarray").T
+    links = coo_array((np.ones(len(a)), (a, b)), shape=(len(points),) * 2)
+    _, labels = connected_components(links, directed=False)
+    order = np.argsort(-np.bincount(labels), kind="stable")
+    return np.argsort(order)[labels]
 
 
 def neighbour_volumes(x: np.ndarray) -> np.ndarray:

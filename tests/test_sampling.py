@@ -19,6 +19,18 @@ def test_ball_has_its_volume():
     assert np.all(np.linalg.norm(x - [1, 2, 3], axis=1) <= 0.5)
 
 
+def test_pieces_are_what_is_within_reach():
+    """The largest first; a chain holds together, and one alone is a piece."""
+    x = np.array([[0.0, 0], [9, 9], [1, 0], [5, 0], [2, 0], [5, 0.9], [3, 0]])
+    assert sampling.pieces(x, 1.0).tolist() == [0, 2, 0, 1, 0, 1, 0]
+    assert sampling.pieces(x, 2.0).tolist() == [0, 1, 0, 0, 0, 0, 0]
+    assert sampling.pieces(x[:1], 1.0).tolist() == [0]
+    with pytest.raises(ValueError, match="`reach` must be positive"):
+        sampling.pieces(x, 0.0)
+    with pytest.raises(ValueError, match="`x` must be finite"):
+        sampling.pieces(x * np.nan, 1.0)
+
+
 @pytest.mark.parametrize("spacing", [0.1, 0.05, 0.025])
 def test_neighbour_volumes_of_a_lattice(spacing):
     """Inside a lattice the estimate is right within 4 %; at the surface it errs to one layer."""

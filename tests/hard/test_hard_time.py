@@ -1,5 +1,7 @@
 """Hard motions: fast, torn, unequal, at rest for long, chaotic, larger than the grid allows."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +26,7 @@ from hard.bodies import (
     tolerance,
     world,
 )
-from pgjax import boundary
+from pgjax import boundary, sampling
 from pgjax.result import Condition
 
 FLOOR = boundary.Box((-9.0, 2 * H), (9.0, 9.0), boundary.Separating())
@@ -92,12 +94,18 @@ def total_energy(scene, state):
 # --- Fast -----------------------------------------------------------------------------------------
 
 
+GAINED = {"FixedCorotated": 0.01, "metal": 0.03, "NeoHookean": 0.035, "paste": 0.01}
+
+
 @every_material
 def test_h28_impact_at_ten_times_the_speed_of_sound(name, holds):
     """Speed governs the step; nothing is lost without being counted, and no energy is made.
 
-    Never more than at the start. That none comes back is true of the law that is not continued
-    anywhere: of the others the energy is not that of the stress where they are clamped.
+    Never more than at the start. What comes back after the least is the error of the time step: of
+    what there was at the start 2.4 % (metal), 2.9 % (neo-Hookean), 0.6 % (paste), and half of it
+    for half the step. Fixed corotated elasticity gives nothing back: its Kirchhoff stress vanishes
+    with J, and the block stays on the floor with 64 % of the energy, crushed to J = 4e-16. Of sand
+    the energy is not that of the stress where it is clamped, which comes back as if it were new.
     """
     x = block(center=(0.55, 0.45))
     scene = world(name, x, walls=FLOOR)
@@ -112,7 +120,7 @@ def test_h28_impact_at_ten_times_the_speed_of_sound(name, holds):
         assert is_finite(state)
         energy = total_energy(scene, state)
         assert energy < 1.01 * first
-        assert name != "FixedCorotated" or energy < least + 0.01 * first
+        assert energy < least + GAINED.get(name, 1.0) * first
         least = min(least, energy)
     lost = int(jnp.sum(~state.alive))
     assert lost == int(state.status.count[Condition.NONFINITE : Condition.OUT_OF_DOMAIN + 1].sum())
@@ -121,6 +129,35 @@ def test_h28_impact_at_ten_times_the_speed_of_sound(name, holds):
     assert int(state.status.count[Condition.INVERTED]) >= inverted.sum()
     names = [k.name for k in Condition if int(state.status.count[k])]
     holds("H28", material=name, outcome=f"status: {', '.join(names)}" if names else "holds")
+
+
+def gained(name, part):
+    """What comes back after the least energy of the impact, in parts of that at the start."""
+    x = block(center=(0.55, 0.45))
+    scene = world(name, x, walls=FLOOR)
+    state = pgjax.initial_state(scene, x, (0.0, -10 * float(scene.rest_sound_speed())))
+    dt = pgjax.stable_dt(scene, state)
+    first = least = total_energy(scene, state)
+    most, t = 0.0, 0.0
+    while t < 120 * dt:
+        smaller = part * min(dt, pgjax.stable_dt(scene, state))
+        state = run(scene, state, smaller, round(4 / part))
+        t += smaller * round(4 / part)
+        energy = total_energy(scene, state)
+        least = min(least, energy)
+        most = max(most, (energy - least) / first)
+    return most
+
+
+@pytest.mark.slow
+@pytest.mark.float64
+@pytest.mark.parametrize("name", ["metal", "NeoHookean"])
+def test_h28_what_is_gained_is_the_error_of_the_step(name, holds):
+    """First order in Δt, until less than 1 % of the energy at the start is left of it."""
+    gains = [gained(name, part) for part in (1.0, 0.5, 0.25, 0.125)]
+    assert gains[-1] < 0.01
+    assert all(0.35 < b / a < 0.65 for a, b in itertools.pairwise(gains))
+    holds("H28", material=name, precision="float64")
 
 
 @every_material
@@ -210,8 +247,10 @@ def test_h31_a_sheet_one_particle_thick(name, holds):
 def test_h32_torn_apart(name, holds):
     """Four particles a cell, drawn out to three times the length: pieces, whole and finite.
 
-    Where neighbours are further apart than the stencil is wide they are separate bodies: that is
-    fracture by the grid, and a valid state; no step looks for neighbours to say so.
+    Where neighbours are further apart than a cell the grid tears a body. That is a valid state, of
+    which no step has to know; `sampling.pieces` counts them in what was saved. A stretch times the
+    spacing, which a step knows, would say less: it comes back after the fracture, and grows
+    without any in what flows.
     """
     x = block(side=5, spacing=0.5 * H)
     scene = world(name, x)
@@ -226,6 +265,8 @@ def test_h32_torn_apart(name, holds):
         if np.ptp(np.asarray(state.x[:, 0])) > 3 * width:
             break
     assert np.ptp(np.asarray(state.x[:, 0])) > 3 * width
+    assert sampling.pieces(x, H).max() == 0
+    assert sampling.pieces(state.x, H).max() >= 1
     assert is_finite(state)
     assert bool(state.status.ok)
     assert largest(momentum(scene, state)) < tolerance(1e-12, 1e-5) * scale
