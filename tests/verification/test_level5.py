@@ -51,7 +51,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow) if "film" in c else c for c in CASES]
+)
 def test_v40_a_tight_grid_costs_no_accuracy(measure, monkeypatch, case):
     """Errors on the tight grid over those with 13 more cells on each side."""
     tight = np.asarray(CASES[case]())

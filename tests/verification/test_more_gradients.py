@@ -214,7 +214,9 @@ def led(problem, direction, sizes, steps):
     return forward, jax.jacrev(end)(zero), jax.lax.map(end, sizes)
 
 
-@pytest.mark.parametrize("kink", KINKS)
+@pytest.mark.parametrize(
+    "kink", [pytest.param(k, marks=slow) if "water" in k else k for k in KINKS]
+)
 def test_g3_at_a_kink_it_is_one_of_two_slopes(measure, kink):
     """Exactly there AD gives one of the one-sided derivatives, never something in between.
 

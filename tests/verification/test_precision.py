@@ -163,7 +163,9 @@ def test_v44_plastic_batch_is_separate(measure):
     measure("V44", "vmap over angles of friction = separate, 40 steps", gap, below=1e-13)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    "dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)], ids=["f64", "f32"]
+)
 def test_v44_restart_from_a_file(measure, tmp_path, dtype):
     """State to disk, back, and on: every bit is that of the run in one piece."""
     scene, state = falling()
