@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import FLOAT32
 
 from pgjax import native
 from pgjax.transfer import primitive, reference
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler")
 
+FLOAT32 = not jax.config.jax_enable_x64
 DTYPE = jnp.float32 if FLOAT32 else jnp.float64
 # Relative to the sum of the magnitudes of what is added.
 TOLERANCE = 1e-6 if FLOAT32 else 1e-13
