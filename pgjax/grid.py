@@ -9,7 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pgjax._types import Array, Bool, Float, Int, as_float_array, require
+from pgjax._types import (
+    Array,
+    Bool,
+    Float,
+    Int,
+    as_float_array,
+    as_tuple,
+    require,
+    require_number,
+    whole_numbers,
+)
 
 # Layers of nodes outside the box, so that the stencil of a particle at the edge fits.
 PAD = 2
@@ -42,10 +52,13 @@ class Grid(eqx.Module):
         *,
         periodic: Sequence[bool] | None = None,
     ):
-        self.origin = as_float_array(origin)
-        self.shape = tuple(int(n) for n in shape)
-        self.h = as_float_array(h)
-        self.periodic = tuple(bool(p) for p in (periodic or (False,) * len(self.shape)))
+        self.origin = as_float_array(origin, "origin")
+        self.shape = whole_numbers("shape", shape)
+        self.h = as_float_array(h, "h")
+        periodic = (False,) * len(self.shape) if periodic is None else periodic
+        self.periodic = as_tuple("periodic", periodic)
+        require("periodic", self.periodic, "hold true or false", lambda a: (a == 0) | (a == 1))
+        self.periodic = tuple(bool(np.all(p)) for p in self.periodic)
 
     def __check_init__(self):
         d = len(self.shape)
@@ -59,6 +72,7 @@ class Grid(eqx.Module):
         if len(self.periodic) != d:
             raise ValueError(f"Argument `periodic` must have {d} entries, but is {self.periodic}.")
         require("origin", self.origin, "be finite", np.isfinite)
+        require_number("h", self.h)
         require("h", self.h, "be positive and finite (m)", lambda a: (a > 0) & np.isfinite(a))
         if min(self.shape) < 1:
             raise ValueError(f"Argument `shape` must be at least 1, but is {self.shape}.")

@@ -14,10 +14,15 @@ from pgjax._types import (
     Float,
     Scalar,
     as_float_array,
+    as_tuple,
     concrete,
+    floating,
     parameter,
     positive,
     require,
+    require_kind,
+    require_shape,
+    whole_numbers,
 )
 from pgjax.boundary import Particles
 from pgjax.grid import Grid
@@ -83,48 +88,60 @@ class Scene(eqx.Module):
         grid_damping: Any = 0.0,
         shear_damping: Any = 0.0,
     ):
+        require_kind("grid", grid, Grid)
         self.grid = grid
-        self.materials = (materials,) if isinstance(materials, Material) else tuple(materials)
-        self.volumes = as_float_array(volumes)
-        self.counts = tuple(counts) if counts is not None else self.volumes.shape
-        self.gravity = jnp.zeros_like(grid.origin) if gravity is None else as_float_array(gravity)
-        self.boundaries = tuple(boundaries)
-        self.particle_conditions = tuple(particle_conditions)
+        single = isinstance(materials, Material)
+        self.materials = (materials,) if single else as_tuple("materials", materials)
+        self.volumes = as_float_array(volumes, "volumes")
+        counts = self.volumes.shape if counts is None else counts
+        self.counts = whole_numbers("counts", counts)
+        gravity = jnp.zeros_like(grid.origin) if gravity is None else gravity
+        self.gravity = as_float_array(gravity, "gravity")
+        self.boundaries = as_tuple("boundaries", boundaries)
+        self.particle_conditions = as_tuple("particle_conditions", particle_conditions)
         self.body_force = body_force
-        self.X0 = None if X0 is None else as_float_array(X0)
+        self.X0 = None if X0 is None else as_float_array(X0, "X0")
         self.spline = BSpline(2) if spline is None else spline
         self.scheme = SplineGradient() if scheme is None else scheme
         self.grid_damping = grid_damping
         self.shear_damping = shear_damping
 
     def __check_init__(self):
+        if self.volumes.ndim != 1:
+            raise ValueError(
+                f"Argument `volumes` must have shape (p,), but has shape {self.volumes.shape}."
+            )
+        for material in self.materials:
+            require_kind("materials", material, Material)
+        require_kind("spline", self.spline, BSpline)
+        require_kind("scheme", self.scheme, AbstractScheme)
         d, n = self.grid.dimension, self.particle_count
-        _check_shape("volumes", self.volumes, (n,))
         if n == 0:
             raise ValueError("Argument `volumes` must hold at least one particle, but is empty.")
         require("volumes", self.volumes, "be positive and finite", positive)
-        if len(self.counts) != len(self.materials) or sum(self.counts) != n:
+        fits = len(self.counts) == len(self.materials) and sum(self.counts) == n
+        if not fits or min(self.counts) < 0:
             raise ValueError(
                 f"Argument `counts` must give the particles of each of {len(self.materials)} "
                 f"material(s), {n} in all, but is {self.counts}."
             )
         for material, count in zip(self.materials, self.counts, strict=True):
             particle_axes(material, count)
-        _check_shape("gravity", self.gravity, (d,))
+        require_shape("gravity", self.gravity, (d,))
         require("gravity", self.gravity, "be finite", np.isfinite)
         for name in ("grid_damping", "shear_damping"):
             value = getattr(self, name)
-            _check_shape(name, value, ())
+            require_shape(name, value, ())
             require(name, value, "be at least 0 (1/s)", lambda a: a >= 0)
         for condition in self.particle_conditions:
             mask = getattr(condition, "mask", None)
             if mask is not None:
-                _check_shape("mask", mask, (n,))
+                require_shape("mask", mask, (n,))
         _check_conditions(self)
         if self.body_force is not None and self.X0 is None:
             raise ValueError("Argument `X0` must be given with `body_force`, but is None.")
         if self.X0 is not None:
-            _check_shape("X0", self.X0, (n, d))
+            require_shape("X0", self.X0, (n, d))
 
     @property
     def particle_count(self) -> int:
@@ -210,6 +227,7 @@ def initial_state(
     Raises:
         ValueError: a shape is wrong, a value is not finite, or a particle is outside the grid.
     """
+    require_kind("scene", scene, Scene)
     dtype = _precision(dtype)
     n, d = scene.particle_count, scene.grid.dimension
     x = _array("x", x, (n, d))
@@ -247,9 +265,13 @@ def _precision(dtype: Any) -> Any:
     default = jnp.zeros(()).dtype
     if dtype is None:
         return default
-    dtype = np.dtype(dtype)
-    if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
+    try:
+        known = np.dtype(dtype)
+    except TypeError:
+        known = None
+    if known not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise ValueError(f"Argument `dtype` must be float32 or float64, but is {dtype}.")
+    dtype = known
     if dtype == np.float64 and default != np.float64:
         raise ValueError(
             "Argument `dtype` must be float32 unless double precision is switched on "
@@ -269,20 +291,9 @@ def _relative(x: Array | np.ndarray, origin: Array) -> Array:
 
 def _array(name: str, value: Any, *shapes: tuple[int, ...]) -> Array | np.ndarray:
     """The value as a floating array of one of the given shapes."""
-    value = value if isinstance(value, jax.Array | np.ndarray) else np.asarray(value)
-    if not jnp.issubdtype(value.dtype, jnp.floating):
-        value = value.astype(jnp.zeros(()).dtype)
-    if value.shape not in shapes:
-        allowed = " or ".join(str(s) for s in shapes)
-        raise ValueError(
-            f"Argument `{name}` must have shape {allowed}, but has shape {value.shape}."
-        )
+    value = floating(name, value)
+    require_shape(name, value, *shapes)
     return value
-
-
-def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
-    if value.shape != shape:
-        raise ValueError(f"Argument `{name}` must have shape {shape}, but has shape {value.shape}.")
 
 
 def _check_conditions(scene: Scene) -> None:

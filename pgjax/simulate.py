@@ -11,7 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pgjax._types import Array, Float, Scalar, concrete
+from pgjax._types import (
+    Array,
+    Float,
+    Scalar,
+    concrete,
+    positive,
+    require,
+    require_kind,
+)
 from pgjax.ledger import Flows, Ledger, balance, followed
 from pgjax.monitor import note_frame, note_start
 from pgjax.result import NEVER, SimulationWarning, Status
@@ -121,6 +129,8 @@ def simulate(
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"Argument `{name}` must be a whole number ≥ 1, but is {value!r}.")
     frames, substeps = int(frames), int(substeps)
+    require_kind("scene", scene, Scene)
+    require_kind("state", state, State)
     _check_count(state, frames * substeps)
     _check_particles(scene, state)
     _check_dt(scene, dt, allow_unstable)
@@ -163,11 +173,12 @@ def _check_particles(scene: Scene, state: State) -> None:
 
 def _check_dt(scene: Scene, dt: float | Array, allow_unstable: bool) -> None:
     """The time step against the sharp bound at rest, before anything is compiled."""
+    require("dt", dt, "be positive and finite (s), one number", positive)
     value = concrete(dt)
     if value is None:
         return
-    if value.ndim or not (np.isfinite(value) and value > 0):
-        raise ValueError(f"Argument `dt` must be positive and finite (s), but is {dt}.")
+    if value.ndim:
+        raise ValueError(f"Argument `dt` must be positive and finite (s), one number, but is {dt}.")
     limit = concrete(scene.rest_limit())
     if limit is None or limit.ndim:
         return

@@ -20,7 +20,7 @@ class BSpline(eqx.Module):
     degree: int = eqx.field(default=2, static=True)
 
     def __check_init__(self):
-        if self.degree not in (2, 3):
+        if not isinstance(self.degree, int) or self.degree not in (2, 3):
             raise ValueError(f"Argument `degree` must be 2 or 3, but is {self.degree}.")
 
     @property

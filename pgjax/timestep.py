@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pgjax._types import Array, Bool, Float, Scalar, concrete, require
+from pgjax._types import Array, Bool, Float, Scalar, concrete, require, require_kind, require_number
 from pgjax.models.material import cast, particle_axes
 from pgjax.models.viscous import positive_volume
 from pgjax.result import NEVER
@@ -94,6 +94,9 @@ def stable_dt(
     Raises:
         ValueError: `fraction` or `frame` is out of range, or a parameter is being traced.
     """
+    require_kind("scene", scene, Scene)
+    require_kind("state", state, State, type(None))
+    require_number("fraction", fraction)
     require("fraction", fraction, "be in (0, 1]", lambda a: (a > 0) & (a <= 1))
     rest = concrete(scene.rest_limit())
     if rest is None:
@@ -112,6 +115,7 @@ def stable_dt(
         )
     if frame is None:
         return dt
+    require_number("frame", frame)
     require("frame", frame, "be positive and finite (s)", lambda a: (a > 0) & np.isfinite(a))
     return frame / substeps_for(frame, dt)
 

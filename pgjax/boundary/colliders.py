@@ -22,7 +22,9 @@ from pgjax._types import (
     Scalar,
     as_float_array,
     concrete,
+    numbers,
     parameter,
+    require_kind,
     require_like,
     require_vector,
 )
@@ -96,12 +98,17 @@ class Collider(AbstractGridCondition):
         self.contact = Separating() if contact is None else contact
         self.motion = motion
         self.surface_velocity = (
-            None if surface_velocity is None else as_float_array(surface_velocity)
+            None
+            if surface_velocity is None
+            else as_float_array(surface_velocity, "surface_velocity")
         )
         self.start = start
         self.end = end
 
     def __check_init__(self):
+        require_kind("shape", self.shape, AbstractShape)
+        require_kind("contact", self.contact, AbstractContact)
+        require_kind("motion", self.motion, AbstractMotion, type(None))
         if self.surface_velocity is not None:
             require_vector("surface_velocity", self.surface_velocity)
         require_window(self.start, self.end)
@@ -152,11 +159,12 @@ class Box(AbstractGridCondition):
         contact: `Sticky()`, `Slip()` or `Separating(friction)`.
     """
 
-    lower: Array = eqx.field(converter=as_float_array)
-    upper: Array = eqx.field(converter=as_float_array)
+    lower: Array = eqx.field(converter=numbers("lower"))
+    upper: Array = eqx.field(converter=numbers("upper"))
     contact: AbstractContact = eqx.field(default_factory=Separating)
 
     def __check_init__(self):
+        require_kind("contact", self.contact, AbstractContact)
         require_vector("lower", self.lower)
         require_like("upper", self.upper, "lower", self.lower)
         lower, upper = concrete(self.lower), concrete(self.upper)

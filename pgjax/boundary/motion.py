@@ -122,8 +122,10 @@ class Steady(AbstractMotion):
         start: Any = 0.0,
         end: Any = float("inf"),
     ):
-        self.linear = as_float_array(velocity)
-        self.pivot = jnp.zeros_like(self.linear) if pivot is None else as_float_array(pivot)
+        self.linear = as_float_array(velocity, "velocity")
+        self.pivot = (
+            jnp.zeros_like(self.linear) if pivot is None else as_float_array(pivot, "pivot")
+        )
         self.angular = turn_like(angular_velocity, self.linear)
         self.start = start
         self.end = end
@@ -166,14 +168,21 @@ class KeyFrames(AbstractMotion):
     pivot: Array
 
     def __init__(self, times: Any, shifts: Any, turns: Any = None, pivot: Any = None):
-        self.times = as_float_array(times)
-        self.shifts = as_float_array(shifts)
+        self.times = as_float_array(times, "times")
+        self.shifts = as_float_array(shifts, "shifts")
+        if self.times.ndim != 1 or self.shifts.ndim != 2:
+            raise ValueError(
+                f"Arguments `times` and `shifts` must have shapes (k,) and (k, d), but have shapes "
+                f"{self.times.shape} and {self.shifts.shape}."
+            )
         d, k = self.shifts.shape[-1], len(self.times)
         if turns is None:
             turns = jnp.zeros((k, 3 if d == 3 else 1), self.shifts.dtype)
-        turns = as_float_array(turns)
+        turns = as_float_array(turns, "turns")
         self.turns = turns[:, None] if turns.ndim == 1 else turns
-        self.pivot = jnp.zeros(d, self.shifts.dtype) if pivot is None else as_float_array(pivot)
+        self.pivot = (
+            jnp.zeros(d, self.shifts.dtype) if pivot is None else as_float_array(pivot, "pivot")
+        )
 
     def __check_init__(self):
         k = self.times.shape[0]
@@ -233,7 +242,7 @@ def turn_like(angular: Any, linear: Array) -> Array:
     k = 3 if linear.shape[-1:] == (3,) else 1
     if angular is None:
         return jnp.zeros(k, linear.dtype)
-    angular = as_float_array(angular)
+    angular = as_float_array(angular, "turn")
     return angular[None] if angular.ndim == 0 else angular
 
 

@@ -5,6 +5,7 @@ any callable will do.
 """
 
 import abc
+import reprlib
 from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
@@ -22,6 +23,7 @@ from pgjax._types import (
     as_float_array,
     concrete,
     nonnegative,
+    numbers,
     parameter,
     require,
     require_number,
@@ -59,6 +61,17 @@ class AbstractParticleCondition(eqx.Module):
         """The particles at the start of the step from t to t + dt."""
 
 
+def _as_mask(value: Any) -> Array:
+    """Which particles; what it is if it is no mask is said later."""
+    try:
+        return jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"Argument `mask` must be a boolean vector, one entry per particle, but is "
+            f"{reprlib.repr(value)}."
+        ) from None
+
+
 @final
 class ParticleMotion(AbstractParticleCondition):
     """Particles of a region are led along a rigid motion, whatever pulls at them.
@@ -74,10 +87,10 @@ class ParticleMotion(AbstractParticleCondition):
         end: end of the window, s; one value or one per particle.
     """
 
-    mask: Array = eqx.field(converter=jnp.asarray)
+    mask: Array = eqx.field(converter=_as_mask)
     motion: AbstractMotion
-    start: Array = eqx.field(default=-float("inf"), converter=as_float_array)
-    end: Array = eqx.field(default=float("inf"), converter=as_float_array)
+    start: Array = eqx.field(default=-float("inf"), converter=numbers("start"))
+    end: Array = eqx.field(default=float("inf"), converter=numbers("end"))
 
     def __check_init__(self):
         _check_mask(self.mask)
@@ -113,12 +126,16 @@ def release_times(
         end: s, after `start`.
         layers: number of layers, at least 2; one by one if None.
     """
-    x, n = np.asarray(x, np.float64), np.asarray(direction, np.float64)
+    x = np.asarray(as_float_array(x, "x"), np.float64)
+    n = np.asarray(as_float_array(direction, "direction"), np.float64)
     if x.ndim != 2 or n.shape != x.shape[1:] or not (n * n).sum() > 0:
         raise ValueError(
             f"Argument `direction` must be a vector other than 0 like the positions "
             f"{x.shape}, but is {n}."
         )
+    for name, value in (("start", start), ("end", end), ("layers", layers)):
+        require_number(name, value)
+    require("start", start, "be finite (s)", np.isfinite)
     require("end", end, f"be after `start` = {start} s", lambda a: a > start)
     if layers is not None:
         require("layers", layers, "be at least 2", lambda a: a >= 2)
@@ -141,8 +158,8 @@ class ParticleImpulse(AbstractParticleCondition):
         duration: how long it lasts, s; at least one step is taken.
     """
 
-    mask: Array = eqx.field(converter=jnp.asarray)
-    momentum: Array = eqx.field(converter=as_float_array)
+    mask: Array = eqx.field(converter=_as_mask)
+    momentum: Array = eqx.field(converter=numbers("momentum"))
     start: Array = parameter(default=0.0)
     duration: Array = parameter(default=0.0)
 
@@ -173,8 +190,8 @@ class ParticleForce(AbstractParticleCondition):
         end: end of the window, s.
     """
 
-    mask: Array = eqx.field(converter=jnp.asarray)
-    force: Array = eqx.field(converter=as_float_array)
+    mask: Array = eqx.field(converter=_as_mask)
+    force: Array = eqx.field(converter=numbers("force"))
     start: Array = parameter(default=0.0)
     end: Array = parameter(default=float("inf"))
 
@@ -224,10 +241,10 @@ class Wind(AbstractParticleCondition):
         start: Any = 0.0,
         end: Any = float("inf"),
     ):
-        self.velocity = velocity if callable(velocity) else as_float_array(velocity)
+        self.velocity = velocity if callable(velocity) else as_float_array(velocity, "velocity")
         self.rate = rate
         self.quadratic = quadratic
-        self.mask = None if mask is None else jnp.asarray(mask)
+        self.mask = None if mask is None else _as_mask(mask)
         self.start = start
         self.end = end
 

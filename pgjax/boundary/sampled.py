@@ -3,7 +3,6 @@
 libigl (https://libigl.github.io) is an optional dependency: `pip install "pgjax[mesh]"`.
 """
 
-import contextlib
 import math
 import os
 import subprocess
@@ -24,12 +23,14 @@ from pgjax.boundary.shapes import SampledSDF
 # Nodes of the lattice: 10⁷ distances to a mesh take about a minute.
 _MOST_NODES = 10_000_000
 _MARGIN = 3  # nodes around the body
-# In a process of its own: a damaged file makes libigl's readers end theirs, or ask for any memory.
+# In a process of its own: a damaged file makes libigl's readers end theirs, or ask for any memory
+# or time.
 _READER = """
 import os, sys, igl, numpy
 try:
     import resource
-    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[3]),) * 2)
+    for limit, most in zip((resource.RLIMIT_AS, resource.RLIMIT_CPU), sys.argv[3:]):
+        resource.setrlimit(limit, (int(most),) * 2)
 except ImportError:
     pass
 vertices, faces = igl.read_triangle_mesh(sys.argv[1])
@@ -37,7 +38,8 @@ with open(sys.argv[2] + ".part", "wb") as file:
     numpy.savez(file, vertices=vertices, faces=faces)
 os.replace(sys.argv[2] + ".part", sys.argv[2])
 """
-_READER_MEMORY, _READER_SECONDS = 2 << 30, 300
+# Bytes and seconds of it, and how many bytes of the file give one more of each.
+_READER_LIMITS = ((2 << 30, 0.01), (5, 1 << 18))
 
 
 def sample_mesh(
@@ -127,18 +129,11 @@ def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     _igl()
     with tempfile.TemporaryDirectory() as folder:
         found = Path(folder) / "mesh.npz"
-        limit = _READER_MEMORY + 100 * file.stat().st_size
-        command = [
-            sys.executable,
-            "-P",
-            "-c",
-            _READER,
-            str(file.absolute()),
-            str(found),
-            str(limit),
-        ]
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            subprocess.run(command, capture_output=True, check=False, timeout=_READER_SECONDS)
+        size = file.stat().st_size
+        limits = [str(least + int(size / step)) for least, step in _READER_LIMITS]
+        arguments = [str(file.absolute()), str(found), *limits]
+        command = [sys.executable, "-P", "-c", _READER, *arguments]
+        subprocess.run(command, capture_output=True, check=False)
         if not found.is_file():
             raise ValueError(f"The file {file} cannot be read as a triangle mesh.")
         with np.load(found) as arrays:

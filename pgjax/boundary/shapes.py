@@ -19,6 +19,7 @@ from pgjax._types import (
     Scalar,
     as_float_array,
     concrete,
+    numbers,
     parameter,
     positive,
     require,
@@ -49,8 +50,8 @@ class HalfSpace(AbstractShape):
         normal: points out of the solid; need not have length 1.
     """
 
-    point: Array = eqx.field(converter=as_float_array)
-    normal: Array = eqx.field(converter=as_float_array)
+    point: Array = eqx.field(converter=numbers("point"))
+    normal: Array = eqx.field(converter=numbers("normal"))
 
     def __check_init__(self):
         require_vector("point", self.point)
@@ -71,7 +72,7 @@ class Sphere(AbstractShape):
         radius: m.
     """
 
-    center: Array = eqx.field(converter=as_float_array)
+    center: Array = eqx.field(converter=numbers("center"))
     radius: Array = parameter()
 
     def __check_init__(self):
@@ -99,8 +100,8 @@ class Cuboid(AbstractShape):
     turn: Array | None
 
     def __init__(self, center: Any, half_size: Any, turn: Any = None):
-        self.center = as_float_array(center)
-        self.half_size = as_float_array(half_size)
+        self.center = as_float_array(center, "center")
+        self.half_size = as_float_array(half_size, "half_size")
         self.turn = None if turn is None else turn_like(turn, self.center)
 
     def __check_init__(self):
@@ -128,8 +129,8 @@ class Cylinder(AbstractShape):
         radius: m.
     """
 
-    start: Array = eqx.field(converter=as_float_array)
-    end: Array = eqx.field(converter=as_float_array)
+    start: Array = eqx.field(converter=numbers("start"))
+    end: Array = eqx.field(converter=numbers("end"))
     radius: Array = parameter()
 
     def __check_init__(self):
@@ -159,8 +160,8 @@ class Capsule(AbstractShape):
         radius: m.
     """
 
-    start: Array = eqx.field(converter=as_float_array)
-    end: Array = eqx.field(converter=as_float_array)
+    start: Array = eqx.field(converter=numbers("start"))
+    end: Array = eqx.field(converter=numbers("end"))
     radius: Array = parameter()
 
     def __check_init__(self):
@@ -209,9 +210,9 @@ class SampledSDF(AbstractShape):
     coefficients: Array
 
     def __init__(self, origin: Any, spacing: Any, values: Any):
-        self.origin = as_float_array(origin)
-        self.spacing = as_float_array(spacing)
-        values = as_float_array(values)
+        self.origin = as_float_array(origin, "origin")
+        self.spacing = as_float_array(spacing, "spacing")
+        values = as_float_array(values, "values")
         # Checked here, since the values are not kept.
         require_vector("origin", self.origin)
         require("spacing", self.spacing, "be positive and finite (m)", positive)

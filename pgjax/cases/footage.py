@@ -4,6 +4,7 @@ import dataclasses
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -144,12 +145,12 @@ def track(t: Table, count: int, last: int) -> Track:
         arrays = _tracked(path)
     except Exception as error:  # Whatever is wrong with the file.
         raise t.error("file", f"be an .npz file ({type(error).__name__}: {error})") from error
-    x = arrays.get("x", np.zeros(0))
+    x: np.ndarray = arrays.get("x", np.zeros(0))
     if x.ndim != 3 or x.shape[2] != 3 or x.size == 0 or x.dtype.kind not in "fiu":
         found = ", ".join(f"{n} {a.shape} {a.dtype}" for n, a in arrays.items())
         raise t.error("file", f"hold numbers x of shape (frames, particles, 3) (it has {found})")
-    numbers = arrays.get("frames", np.arange(len(x)))
-    particles = arrays.get("particles", np.arange(x.shape[1]))
+    numbers: np.ndarray = arrays.get("frames", np.arange(len(x)))
+    particles: np.ndarray = arrays.get("particles", np.arange(x.shape[1]))
     if len(numbers.ravel()) != len(x) or len(particles.ravel()) != x.shape[1]:
         raise t.error(
             "file",
@@ -163,7 +164,7 @@ def track(t: Table, count: int, last: int) -> Track:
     return Track(numbers, x, particles)
 
 
-def _tracked(path: Path) -> dict[str, np.ndarray]:
+def _tracked(path: Path) -> dict[str, Any]:
     """The arrays of a track; what else the file holds is left alone, and no bomb is unpacked."""
     with path.open("rb") as stream, np.load(stream) as data:
         names = [name for name in ("x", "frames", "particles") if name in data.files]

@@ -6,7 +6,7 @@ from typing import Any, final
 import equinox as eqx
 import jax.numpy as jnp
 
-from pgjax._types import Array, Float, Matrix3, Scalar, Vector3, as_float_array, parameter, require
+from pgjax._types import Array, Float, Matrix3, Scalar, Vector3, parameter, require
 
 
 @final
@@ -28,7 +28,7 @@ class ActiveStress(eqx.Module):
             that of s = 1: keep it within [−1, 1].
     """
 
-    direction: Array = eqx.field(converter=as_float_array, metadata={"parameter": True, "rank": 1})
+    direction: Array = parameter(metadata={"rank": 1})
     activation: Array = parameter()
     signal: Callable[[Any], Any] | None = None
 

@@ -6,7 +6,7 @@ from typing import Any, final
 import equinox as eqx
 import jax
 
-from pgjax._types import Array, Matrix3, Scalar, is_parameter, parameter, require
+from pgjax._types import Array, Matrix3, Scalar, is_parameter, parameter, require, require_kind
 from pgjax.models.active import ActiveStress
 from pgjax.models.law import AbstractElasticity, AbstractLaw, Response
 from pgjax.models.plasticity import AbstractPlasticity
@@ -36,6 +36,7 @@ class Material(eqx.Module):
         density: Any = 1000.0,
         active: ActiveStress | None = None,
     ):
+        require_kind("elasticity", elasticity, AbstractLaw)
         companion = elasticity.companion() if plasticity is None else plasticity
         self.elasticity = elasticity
         self.plasticity = companion if isinstance(companion, AbstractPlasticity) else None

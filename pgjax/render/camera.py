@@ -1,6 +1,7 @@
 """Pinhole cameras with OpenCV axes."""
 
 import math
+import reprlib
 from collections.abc import Sequence
 from typing import Any, SupportsFloat, final
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from pgjax._types import Array, Float, as_float_array, concrete, require
+from pgjax._types import Array, Float, concrete, numbers, require, require_number
 from pgjax.render.gaussians import require_rotation
 
 Triple = Sequence[ArrayLike] | ArrayLike
@@ -33,22 +34,21 @@ class Camera(eqx.Module):
         near: what lies at a smaller Z is not drawn, in the units of the scene.
     """
 
-    world_to_camera: Float[Array, "4 4"] = eqx.field(converter=as_float_array)
-    fx: Float[Array, ""] = eqx.field(converter=as_float_array)
-    fy: Float[Array, ""] = eqx.field(converter=as_float_array)
-    cx: Float[Array, ""] = eqx.field(converter=as_float_array)
-    cy: Float[Array, ""] = eqx.field(converter=as_float_array)
+    world_to_camera: Float[Array, "4 4"] = eqx.field(converter=numbers("world_to_camera"))
+    fx: Float[Array, ""] = eqx.field(converter=numbers("fx"))
+    fy: Float[Array, ""] = eqx.field(converter=numbers("fy"))
+    cx: Float[Array, ""] = eqx.field(converter=numbers("cx"))
+    cy: Float[Array, ""] = eqx.field(converter=numbers("cy"))
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
-    near: Float[Array, ""] = eqx.field(converter=as_float_array, default=0.01)
+    near: Float[Array, ""] = eqx.field(default=0.01, converter=numbers("near"))
 
     def __check_init__(self):
         for name in ("fx", "fy", "near"):
             require(name, getattr(self, name), "be positive", lambda a: (a > 0) & np.isfinite(a))
         for name in ("cx", "cy", "world_to_camera"):
             require(name, getattr(self, name), "be finite", np.isfinite)
-        for name in ("width", "height"):
-            require(name, getattr(self, name), "be at least 1", lambda a: a >= 1)
+        _require_size(self.width, self.height)
         if self.world_to_camera.shape != (4, 4):
             raise ValueError(
                 "Argument `world_to_camera` must have shape (4, 4), "
@@ -99,6 +99,7 @@ class Camera(eqx.Module):
             fov_y: vertical opening angle in radians; give it or `focal`.
             focal: focal length in pixels.
         """
+        _require_size(width, height)
         position, up = _vector("eye", eye), _vector("up", up)
         forward = _vector("target", target) - position
         distance = math.hypot(*forward)
@@ -147,6 +148,9 @@ class Camera(eqx.Module):
             fov_y: vertical opening angle in radians; give it or `focal`.
             focal: focal length in pixels.
         """
+        for name, value in (("radius", radius), ("elevation", elevation), ("azimuth", azimuth)):
+            require_number(name, value)
+            require(name, value, "be finite", np.isfinite)
         require("radius", radius, "be positive", lambda a: a > 0)
         require("elevation", elevation, "be inside (−π/2, π/2)", lambda a: np.abs(a) < math.pi / 2)
         vertical = _vector("up", up)
@@ -171,9 +175,21 @@ class Camera(eqx.Module):
         )
 
 
+def _require_size(width: Any, height: Any) -> None:
+    for name, value in (("width", width), ("height", height)):
+        require_number(name, value)
+        require(name, value, "be at least 1", lambda a: a >= 1)
+        require(name, value, "be a whole number", lambda a: a % 1 == 0)
+
+
 def _vector(name: str, value: Any) -> np.ndarray:
     """Three finite numbers in double precision."""
-    array = np.asarray(value, dtype=np.float64)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"Argument `{name}` must be three numbers, but is {reprlib.repr(value)}."
+        ) from None
     if array.shape != (3,):
         raise ValueError(f"Argument `{name}` must be three numbers, but has shape {array.shape}.")
     require(name, array, "be finite", np.isfinite)
@@ -192,7 +208,10 @@ def _focal(fov_y: SupportsFloat | None, focal: SupportsFloat | None, height: int
             "Exactly one of the arguments `fov_y` and `focal` must be given, but "
             f"fov_y={fov_y} and focal={focal}."
         )
+    for name, value in (("focal", focal), ("fov_y", fov_y)):
+        require_number(name, value)
     if focal is not None:
+        require("focal", focal, "be finite (pixels)", np.isfinite)
         return float(focal)
     assert fov_y is not None
     require("fov_y", fov_y, "be between 0 and π radians", lambda a: (a > 0) & (a < math.pi))

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pgjax._types import Array, Bool, Float, Scalar, as_float_array, concrete, require
+from pgjax._types import Array, Bool, Float, Scalar, concrete, numbers, require, require_shape
 from pgjax.linalg import isotropic, polar, svd
 from pgjax.render.harmonics import COUNTS
 
@@ -24,9 +24,9 @@ class Similarity(eqx.Module):
         translation: t, in simulation units.
     """
 
-    scale: Float[Array, ""] = eqx.field(converter=as_float_array)
-    rotation: Float[Array, "3 3"] = eqx.field(converter=as_float_array)
-    translation: Float[Array, "3"] = eqx.field(converter=as_float_array)
+    scale: Float[Array, ""] = eqx.field(converter=numbers("scale"))
+    rotation: Float[Array, "3 3"] = eqx.field(converter=numbers("rotation"))
+    translation: Float[Array, "3"] = eqx.field(converter=numbers("translation"))
 
     def __check_init__(self):
         require("scale", self.scale, "be positive and finite", lambda s: (s > 0) & np.isfinite(s))
@@ -53,6 +53,7 @@ def require_rotation(name: str, matrix: Any) -> None:
     value = concrete(matrix)
     if value is None:
         return
+    require_shape(name, value, (3, 3))
     value = value.astype(np.float64)
     error = np.abs(value @ value.T - np.eye(3)).max()
     det = np.linalg.det(value)
@@ -82,14 +83,14 @@ class Gaussians(eqx.Module):
     ACM Transactions on Graphics 42(4), 2023.
     """
 
-    means: Float[Array, "n 3"] = eqx.field(converter=as_float_array)
-    factors: Float[Array, "n 3 3"] = eqx.field(converter=as_float_array)
-    opacities: Float[Array, " n"] = eqx.field(converter=as_float_array)
-    sh: Float[Array, "n k 3"] = eqx.field(converter=as_float_array)
-    frames: Float[Array, "n 3 3"] = eqx.field(converter=as_float_array)
+    means: Float[Array, "n 3"] = eqx.field(converter=numbers("means"))
+    factors: Float[Array, "n 3 3"] = eqx.field(converter=numbers("factors"))
+    opacities: Float[Array, " n"] = eqx.field(converter=numbers("opacities"))
+    sh: Float[Array, "n k 3"] = eqx.field(converter=numbers("sh"))
+    frames: Float[Array, "n 3 3"] = eqx.field(converter=numbers("frames"))
 
     def __check_init__(self):
-        n = self.means.shape[0]
+        n = len(self.means) if self.means.ndim else 0
         shapes = {"means": (n, 3), "factors": (n, 3, 3), "opacities": (n,), "frames": (n, 3, 3)}
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:

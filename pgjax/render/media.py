@@ -44,8 +44,10 @@ def save_image(path: str | os.PathLike[str], rgb: ArrayLike) -> None:
     """
     target = with_suffix(path, (".png",))
     pixels = _bytes("rgb", rgb)
+    encoded: Any = imageio.imwrite("<bytes>", pixels, extension=".png")
+    # By ourselves: on a full disk the writer would fail once more when it is forgotten.
     with replacing(target) as temporary:
-        imageio.imwrite(temporary, pixels)
+        temporary.write_bytes(encoded)
 
 
 def load_image(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:

@@ -10,7 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from pgjax._types import Array, Float, Scalar, Vector3, as_float_array, concrete, require
+from pgjax._types import (
+    Array,
+    Float,
+    Scalar,
+    Vector3,
+    as_float_array,
+    as_tuple,
+    concrete,
+    require,
+    require_kind,
+    require_shape,
+)
 from pgjax.render.camera import Camera, Triple
 from pgjax.render.gaussians import rotation_of
 
@@ -49,15 +60,16 @@ class CameraPath(eqx.Module):
     def __init__(
         self, times: Numbers, cameras: Sequence[Camera] | Camera, *, up: Triple | None = None
     ):
-        self.times = as_float_array(times)
+        self.times = as_float_array(times, "times")
         self.cameras = _stacked(cameras)
-        self.up = None if up is None else as_float_array(up)
+        self.up = None if up is None else as_float_array(up, "up")
 
     def __check_init__(self):
         keys = self.cameras.world_to_camera
         _require_times(self.times, keys.shape[0] if keys.ndim == 3 else 1)
         if self.up is None:
             return
+        require_shape("up", self.up, (3,))
         require("up", jnp.linalg.norm(self.up), "not be zero", lambda a: a > 0)
         tilts = jnp.abs(keys[:, 0, :3] @ (self.up / jnp.linalg.norm(self.up)).astype(keys.dtype))
         require("cameras", tilts, "not be rolled about `up`", lambda a: a < _LEVEL)
@@ -89,7 +101,9 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     `jax.vmap(lambda camera: render(gaussians, camera))(stack_cameras(cameras))` draws from all of
     them at once.
     """
-    cameras = list(cameras)
+    cameras = list(as_tuple("cameras", cameras))
+    for camera in cameras:
+        require_kind("cameras", camera, Camera)
     if not cameras:
         raise ValueError("Argument `cameras` must hold at least one camera, but is empty.")
     sizes = sorted({(camera.width, camera.height) for camera in cameras})

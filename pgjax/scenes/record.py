@@ -6,17 +6,29 @@ While a run goes on, `resume/` in its folder holds the pictures drawn so far, th
 
 import dataclasses
 import json
+import math
 import re
+import reprlib
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from pgjax._files import is_file, read_text
+from pgjax.result import NEVER
 from pgjax.scenes.build import Plan
 from pgjax.storage import digest, durably_replacing
 
 _VERSION = 1
+_LONGEST_RECORD = 1 << 20
+# Of the numbers of a record; none is NaN.
+_RANGES = {
+    "frames": (1, NEVER),
+    "frame": (-1, NEVER),
+    "most_bounded": (0, NEVER),
+    "seconds": (0, math.inf),
+}
 # Parts of a plan that decide no frame: how many there are, and where the particles came from.
 _IRRELEVANT = ("frames", "notes", "models", "body")
 # What a killed run leaves of a file that it was writing.
@@ -64,10 +76,10 @@ def unfinished(folder: Path) -> Record | None:
         ValueError: the record is broken, or of another version.
     """
     path = record_path(folder)
-    if not path.is_file():
+    if not is_file(path):
         return None
     try:
-        return _parsed(json.loads(path.read_text(encoding="utf-8")))
+        return _parsed(json.loads(read_text(path, _LONGEST_RECORD)))
     except (ValueError, RecursionError) as error:
         raise ValueError(
             f"The file {path} must be the record of an unfinished run, but is broken: {error}."
@@ -81,7 +93,12 @@ def _parsed(content: Any) -> Record:
     for field in dataclasses.fields(Record):
         value = content.get(field.name)
         if type(value) is not (dict if field.name == "fingerprint" else field.type):
-            raise ValueError(f"`{field.name}` is {value!r}")
+            raise ValueError(f"`{field.name}` is {reprlib.repr(value)}")
+    for name, (least, most) in _RANGES.items():
+        if not least <= content[name] <= most:
+            raise ValueError(f"`{name}` is {content[name]}")
+    if not all(isinstance(mark, str) for mark in content["fingerprint"].values()):
+        raise ValueError("`fingerprint` is not of texts")
     return Record(**{field.name: content[field.name] for field in dataclasses.fields(Record)})
 
 
