@@ -160,7 +160,7 @@ def _read_header(file: Path) -> _Header:
 def _newline(head: bytes) -> bytes:
     """What ends the first line, and every other one of the header."""
     after = head[3:5]
-    return after if after == b"\r\n" else after[:1]
+    return after if after == b"\r\n" else after[:1] or b"\n"
 
 
 def _require_room(file: Path, header: _Header, header_size: int, binary: bool) -> None:

@@ -106,8 +106,9 @@ def test_noise(folder, content, start):
             load(folder, name, start + content)
 
 
-# A header of few bytes that asks for much.
+# A header of few bytes that asks for much, or for nothing.
 HUGE = [
+    b"ply",
     ply(vertices=10**12),
     ply(vertices="9" * 5000),
     ply(vertices=-1),

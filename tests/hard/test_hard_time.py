@@ -94,7 +94,12 @@ def total_energy(scene, state):
 # --- Fast -----------------------------------------------------------------------------------------
 
 
-GAINED = {"FixedCorotated": 0.01, "metal": 0.03, "NeoHookean": 0.035, "paste": 0.01}
+GAINED = {
+    "FixedCorotated": 0.01,
+    "metal": 0.03,
+    "NeoHookean": tolerance(0.035, 0.15),
+    "paste": 0.01,
+}
 
 
 @every_material
@@ -103,7 +108,8 @@ def test_h28_impact_at_ten_times_the_speed_of_sound(name, holds):
 
     Never more than at the start. What comes back after the least is the error of the time step: of
     what there was at the start 2.4 % (metal), 2.9 % (neo-Hookean), 0.6 % (paste), and half of it
-    for half the step. Fixed corotated elasticity gives nothing back: its Kirchhoff stress vanishes
+    for half the step; neo-Hookean in single precision 9 %, since volumes of 1e-8 are rounding
+    there. Fixed corotated elasticity gives nothing back: its Kirchhoff stress vanishes
     with J, and the block stays on the floor with 64 % of the energy, crushed to J = 4e-16. Of sand
     the energy is not that of the stress where it is clamped, which comes back as if it were new.
     """
