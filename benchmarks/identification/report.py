@@ -54,7 +54,7 @@ def _markdown(machine: dict, rows: list[dict]) -> str:
         "particles, spacing / 1.5, half the time step. Errors in decades (log10), as a part of the "
         "truth (relative), or absolute. Intervals are 95 %; *mismatch* is the derivative against "
         "the secant over the interval. The data have no noise: intervals of the tier *self* are "
-        "those of rounding, those of *cross* take a misfit of the discretisation for noise. "
+        "those of rounding, of *cross* of the scatter between frames where that is wider. "
         "Iterations are counted over all stages; a tangent counts as a simulation.",
         "",
         "| case | tier | unknown | truth | estimate | error | demanded | met | 95 % interval | "

@@ -96,6 +96,7 @@ def _moved(
     scene, state = problem.build(problem.space.values(u))
 
     def path(v: Array) -> Array:
+        """Positions in each frame, over the initial velocities."""
         trajectory = simulate(
             scene,
             eqx.tree_at(lambda s: s.v, state, v),

@@ -207,6 +207,7 @@ class Problem(AbstractProblem):
         """Number of the frame each entry of the residual is of, `(m,)`."""
 
         def parts(values: Values) -> list[Array]:
+            """The residual of each observation, of a body that stays where it is."""
             # The motion is not needed for its shape: the initial state, again and again.
             _, state = self.build(values)
             return [

@@ -12,6 +12,7 @@ from pgjax import boundary
 
 E, NU, RHO, H, N = 1e4, 0.3, 1000.0, 0.1, 12
 WALLS = boundary.Box((-9.0, -9.0), (9.0, 9.0))
+FLOOR = boundary.Box((-9.0, 2 * H), (9.0, 9.0), boundary.Separating())
 
 MATERIALS = {
     "FixedCorotated": pm.Material(pm.FixedCorotated(E, NU), density=RHO),
@@ -93,6 +94,11 @@ def is_finite(*trees):
 def motion(state):
     """What moves and deforms of a state."""
     return state.position, state.v, state.C, state.He
+
+
+def bits(state):
+    """The same as bytes."""
+    return [np.asarray(a).tobytes() for a in motion(state)]
 
 
 def momentum(scene, state):

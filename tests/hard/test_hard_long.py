@@ -9,12 +9,14 @@ import pytest
 import pgjax
 import pgjax.models as pm
 from hard.bodies import (
+    FLOOR,
     MATERIALS,
     NU,
     RHO,
     E,
     H,
     N,
+    bits,
     block,
     every_material,
     is_finite,
@@ -25,13 +27,6 @@ from hard.bodies import (
     world,
 )
 from pgjax import boundary, native
-
-FLOOR = boundary.Box((-9.0, 2 * H), (9.0, 9.0), boundary.Separating())
-
-
-def bits(state):
-    return [np.asarray(a).tobytes() for a in motion(state)]
-
 
 # --- Long -----------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import pytest
 import pgjax
 import pgjax.models as pm
 from hard.bodies import (
+    FLOOR,
     MATERIALS,
     NU,
     RHO,
@@ -21,20 +22,12 @@ from hard.bodies import (
     kinetic,
     largest,
     momentum,
-    motion,
     run,
     tolerance,
     world,
 )
 from pgjax import boundary, sampling
 from pgjax.result import Condition
-
-FLOOR = boundary.Box((-9.0, 2 * H), (9.0, 9.0), boundary.Separating())
-
-
-def bits(state):
-    return [np.asarray(a).tobytes() for a in motion(state)]
-
 
 # --- Many particles in a cell ---------------------------------------------------------------------
 
