@@ -158,13 +158,13 @@ def as_tuple(name: str, value: Any) -> tuple[Any, ...]:
 
 
 def whole_numbers(name: str, values: Any) -> tuple[int, ...]:
-    """Whole numbers of up to 31 bits as such: 8.0 is one, 8.5 and NaN are none."""
+    """Whole numbers of up to 63 bits as such: 8.0 is one, 8.5 and NaN are none."""
     found = as_tuple(name, values)
     for value in found:
         number = isinstance(value, int | float | np.integer | np.floating)
-        if not number or not abs(value) < 2**31 or value != int(value):
+        if not number or not abs(value) < 2**63 or value != int(value):
             raise ValueError(
-                f"Argument `{name}` must hold whole numbers below 2^31, but is "
+                f"Argument `{name}` must hold whole numbers below 2^63, but is "
                 f"{reprlib.repr(values)}."
             )
     return tuple(int(value) for value in found)
