@@ -11,8 +11,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from pgjax.render import Camera, deform, render
-from pgjax.scenes import procedural
-from pgjax.scenes.procedural import MODELS, ficus
+from pgjax.scenes.procedural import MODELS
+from pgjax.scenes.procedural import ficus as procedural
+from pgjax.scenes.procedural.ficus import ficus
 
 SEEDS = (0, 1, 2)
 PER_LEAF = len(procedural._LEAF_S)

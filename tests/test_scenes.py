@@ -233,3 +233,42 @@ def test_examples_are_valid(path):
 def test_example_cases_are_valid(path, tmp_path):
     (tmp_path / "frames").mkdir()
     assert read_case(path, tmp_path / "frames").unknowns
+
+
+FINE = """
+[quality.fine]
+grid.spacing = 0.05
+time = { frames = 7 }
+"""
+
+
+def test_a_quality_changes_what_it_says_and_nothing_else(folder):
+    path = folder / "drop.toml"
+    path.write_text(path.read_text() + FINE)
+    plain, fine = read_scene(path), read_scene(path, "fine")
+    assert (plain.grid.spacing, fine.grid.spacing) == (0.1, 0.05)
+    assert (plain.time.frames, fine.time.frames) == (3, 7)
+    assert plain.time.fps == fine.time.fps
+    assert plain.grid.lower == fine.grid.lower
+    assert plain.models[0].size == fine.models[0].size
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (FINE.replace("fine", "paper"), "`quality` must be one of the scene file's, which has pap"),
+        ("", "`quality` must be one of the scene file's, which has none, but is 'fine'"),
+        ("[quality]\nfine = 1", r"\[quality.fine\]: `fine` is not a known key"),
+        ("[quality.fine]\ngrd.spacing = 1", r"`grd` is not a known key \(did you mean `grid`\?\)"),
+        ("[quality.other]\ngrid.spacin = 1", r"\[quality.other\] \[grid\]: `spacin` is not"),
+        (
+            "[quality.other]\ngrid.spacing = -1",
+            r"\[grid\]: `spacing` must be a finite number above",
+        ),
+    ],
+)
+def test_a_quality_that_cannot_be_is_named(folder, text, message):
+    path = folder / "drop.toml"
+    path.write_text(path.read_text() + text)
+    with pytest.raises(SceneError, match=message):
+        read_scene(path, "fine")

@@ -149,7 +149,10 @@ def _with_model(file: SceneFile, ply: Path) -> SceneFile:
             f"{file.source}: another model can replace the one of a scene with one [model] only, "
             f"but there are {len(file.models)}."
         )
-    return dataclasses.replace(file, models=(dataclasses.replace(part, ply=ply, procedural=None),))
+    # A region of a model that a program made is in coordinates that the capture does not have.
+    region = None if part.ply is None else part.region
+    other = dataclasses.replace(part, ply=ply, procedural=None, region=region)
+    return dataclasses.replace(file, models=(other,))
 
 
 def _scene(file: SceneFile, crowd: Crowd, counts: tuple[int, ...], still: Gaussians) -> Scene:

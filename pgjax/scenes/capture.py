@@ -75,7 +75,7 @@ def _load(part: ModelPart) -> Capture:
     if part.ply is not None:
         return load_capture(part.ply)
     assert part.procedural is not None
-    made = MODELS[part.procedural](part.seed)
+    made = MODELS[part.procedural](part.seed, part.detail)
     return Capture(made, np.arange(len(made)), len(made))
 
 

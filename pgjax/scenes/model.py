@@ -12,6 +12,9 @@ from pgjax.scenes.reader import Table, missing_file, nearest
 from pgjax.scenes.regions import AbstractRegion, Triple, region
 from pgjax.scenes.turns import radians, rotation
 
+# Of a procedural model; 1000 times as many Gaussians are more than anybody wants.
+_MOST_DETAIL = 10.0
+
 
 @dataclasses.dataclass(frozen=True)
 class FillPart:
@@ -33,6 +36,7 @@ class ModelPart:
         ply: the captured model, of any format that `load_gaussians` reads; or None.
         procedural: the name of a model made by a program; or None.
         seed: of the procedural model.
+        detail: of the procedural model: how many times nearer its Gaussians are to each other.
         up: direction in the model that points up; by its kind if None.
         turn: rotation of the upright model, `(3, 3)`.
         opacity_above: Gaussians of no more opacity are left out.
@@ -52,6 +56,7 @@ class ModelPart:
     ply: Path | None
     procedural: str | None
     seed: int
+    detail: float
     up: Triple | None
     turn: np.ndarray
     opacity_above: float
@@ -95,6 +100,7 @@ def model(t: Table) -> ModelPart:
         ply=ply,
         procedural=procedural,
         seed=t.integer("seed", 0, at_least=0) if ply is None else 0,
+        detail=t.number("detail", 1.0, above=0, below=_MOST_DETAIL) if ply is None else 1.0,
         up=up,
         turn=rotation(t),
         opacity_above=t.number("opacity_above", 0.02, at_least=0, below=1),

@@ -242,6 +242,27 @@ class Table:
         names = (f"{self.name} [[{key}]] {i + 1}" for i in range(len(value)))
         return [Table(name, v, self.folder) for name, v in zip(names, value, strict=True)]
 
+    def variants(self, key: str, parts: Sequence[str]) -> tuple["Table", dict[str, "Table"]]:
+        """This table without a key, and what each table that is written under it makes of the rest.
+
+        Such a table says what is different in some of the `parts`, which are tables themselves.
+        """
+        plain = {name: value for name, value in self._data.items() if name != key}
+        made = {}
+        for name, changes in self._data.get(key, {}).items() if self.is_a(key, dict) else ():
+            label = f"{self.name} [{key}.{name}]"
+            here = Table(label, changes if isinstance(changes, dict) else {name: changes})
+            varied = dict(plain)
+            for part in parts:
+                if here.has(part) and not isinstance(plain.get(part, {}), dict):
+                    raise here.error(part, "be left out where the scene has several of it")
+                varied[part] = {**plain.get(part, {}), **dict(here.table(part, {})._data)}
+            here.close()
+            made[name] = Table(label, {k: v for k, v in varied.items() if v}, self.folder)
+        if self.has(key) and not self.is_a(key, dict):
+            raise self.error(key, "be a table of tables")
+        return Table(self.name, plain, self.folder), made
+
     def read(self, reader: Callable[["Table"], T]) -> T:
         """Apply a reader to this table; `ValueError`s name the table, leftovers are errors."""
         with naming(self.name):

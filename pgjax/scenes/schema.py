@@ -75,19 +75,36 @@ class SceneFile:
     particle_conditions: tuple[ParticlesPart, ...]
 
 
-def read_scene(path: Path) -> SceneFile:
-    """Read a scene file.
+# What a quality may change.
+_VARIED = ("model", "grid", "time", "camera")
+
+
+def read_scene(path: Path, quality: str | None = None) -> SceneFile:
+    """Read a scene file, in one of the qualities it has tables of, or as it is.
 
     Raises:
-        SceneError: a key is unknown, missing, of the wrong type or out of range, or a file is
-            missing or unusable. (Models are loaded by `plan`.)
+        SceneError: a key is unknown, missing, of the wrong type or out of range, a file is
+            missing or unusable, or there is no such quality. (Models are loaded by `plan`.)
     """
-    return scene_from(parse(path), path.stem)
+    return scene_from(parse(path), path.stem, quality)
 
 
-def scene_from(root: Table, name: str) -> SceneFile:
-    """The scene of a parsed file; `name` is its name if it has none of its own."""
-    return root.read(lambda table: _scene(table, name))
+def scene_from(root: Table, name: str, quality: str | None = None) -> SceneFile:
+    """The scene of a parsed file; `name` is its name if it has none of its own.
+
+    All its qualities are checked, whichever is wanted.
+    """
+    plain, variants = root.variants("quality", _VARIED)
+    scenes = {None: plain.read(lambda table: _scene(table, name))}
+    for key, variant in variants.items():
+        scenes[key] = variant.read(lambda table: _scene(table, name))
+    if quality not in scenes:
+        offered = ", ".join(variants) if variants else "none"
+        raise SceneError(
+            f"{root.name}: `quality` must be one of the scene file's, which has {offered}"
+            f"{nearest(str(quality), variants)}, but is {quality!r}."
+        )
+    return scenes[quality]
 
 
 def _scene(root: Table, name: str) -> SceneFile:

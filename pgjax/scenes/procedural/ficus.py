@@ -1,19 +1,25 @@
-"""Scenes made by a program instead of a camera: Gaussians that are also particles of a solid.
-
-Every body is filled throughout its volume, so that its Gaussians can be simulated as they are.
-Lengths are in metres and z points up.
-"""
+"""A potted ficus."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from pgjax.render.gaussians import Gaussians
+from pgjax.scenes.procedural.bodies import (
+    LIGHT,
+    UP,
+    Body,
+    axes,
+    disks_and_balls,
+    join,
+    lit,
+    select,
+    transmittance,
+    unit,
+)
 
 _POT_SPACING = 0.02
 _WOOD_SPACING = 0.017
@@ -26,8 +32,6 @@ _LEAF_S = np.array([0, 0, 0, 0.08, 0.28, 0.48, 0.68, *_LEAF_PAIRS, 0.93])
 _LEAF_SIDE = np.array([0] * 7 + [-1, 1] * 4 + [0])
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-_UP = np.array([0.0, 0.0, 1.0])
-_LIGHT = np.array([0.55, -0.45, 0.70]) / np.linalg.norm([0.55, -0.45, 0.70])
 
 _TERRACOTTA = np.array([0.70, 0.37, 0.25])
 _SOIL = np.array([0.20, 0.13, 0.09])
@@ -35,16 +39,6 @@ _BARK = np.array([0.54, 0.44, 0.34])
 _DARK_GREEN = np.array([0.14, 0.37, 0.15])
 _LIGHT_GREEN = np.array([0.37, 0.55, 0.19])
 _MIDRIB = np.array([0.66, 0.80, 0.42])
-
-
-class _Body(NamedTuple):
-    """Unlit Gaussians: orthonormal axes in the columns of `frames`, the last one the normal."""
-
-    means: np.ndarray
-    frames: np.ndarray
-    scales: np.ndarray
-    albedo: np.ndarray
-    gloss: np.ndarray
 
 
 class _Branch(NamedTuple):
@@ -59,7 +53,7 @@ class _Branch(NamedTuple):
         return self.points[round(fraction * (len(self.points) - 1))]
 
 
-def ficus(seed: int = 0) -> Gaussians:
+def ficus(seed: int = 0, detail: float = 1.0) -> Gaussians:
     """A potted ficus one metre high on the plane z = 0, of some 9000 Gaussians.
 
     Pot, soil and wood are filled solids; leaves are blades of flat Gaussians on stalks. A sun from
@@ -68,41 +62,23 @@ def ficus(seed: int = 0) -> Gaussians:
 
     Args:
         seed: decides the shape of the tree and the place of its leaves.
+        detail: must be 1: leaves are drawn by hand.
+
+    Raises:
+        ValueError: `detail` is not 1.
     """
+    if detail != 1:
+        raise ValueError(f"Argument `detail` must be 1 for a ficus, but is {detail:g}.")
     rng = np.random.default_rng(seed)
     branches = _tree(rng)
     pot = _pot(rng)
-    pot = _select(pot, _depth_inside(pot.means, branches) < 0.3 * _WOOD_SPACING)
+    pot = select(pot, _depth_inside(pot.means, branches) < 0.3 * _WOOD_SPACING)
     leaves = _leaves(*_buds(branches[1:], rng), rng)
-    body = _Body(*_join([pot, _wood(branches, rng), leaves]))
+    body = Body(*join([pot, _wood(branches, rng), leaves]))
     # A few per cent larger or smaller, for a height of exactly one metre.
     height = body.means[:, 2].max()
-    return _lit(body._replace(means=body.means / height, scales=body.scales / height))
-
-
-MODELS = {"ficus": ficus}
-"""The models by name: functions of a seed."""
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors of shape (…, 3) divided by their lengths."""
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def _join(records: Sequence[tuple]) -> Iterator[np.ndarray]:
-    """The fields of several records, each in one array."""
-    return (np.concatenate(fields) for fields in zip(*records, strict=True))
-
-
-def _select(body: _Body, kept: np.ndarray) -> _Body:
-    """The Gaussians that a mask selects."""
-    return _Body(*(part[kept] for part in body))
-
-
-def _frames(normals: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Right-handed orthonormal axes: near `along`, across it, and the normal; (n, 3, 3)."""
-    across = _unit(np.cross(normals, along))
-    return np.stack([np.cross(across, normals), across, normals], axis=-1)
+    body = body._replace(means=body.means / height, scales=body.scales / height)
+    return lit(body, transmittance(body.means, UP), transmittance(body.means, LIGHT))
 
 
 def _disk(radius: float, spacing: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
@@ -119,31 +95,21 @@ def _disk(radius: float, spacing: float, turn: float) -> tuple[np.ndarray, np.nd
 def _sweep(branch: _Branch, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 3) that fill a branch disk by disk, and the ring and the place of each."""
     first = np.eye(3)[np.argmin(np.abs(branch.tangents.mean(axis=0)))]
-    e1 = _unit(np.cross(branch.tangents, first))
+    e1 = unit(np.cross(branch.tangents, first))
     e2 = np.cross(branch.tangents, e1)
     # Half a turn more in every second disk staggers the points, which closes the surface best.
     disks = [_disk(radius, spacing, i % 2 / 2) for i, radius in enumerate(branch.radii)]
     place = np.repeat(np.arange(len(disks)), [len(ring) for _, ring in disks])
-    disk, ring = _join(disks)
+    disk, ring = join(disks)
     return branch.points[place] + disk[:, :1] * e1[place] + disk[:, 1:] * e2[place], ring, place
 
 
-def _solid(
-    means: np.ndarray, normals: np.ndarray, surface: np.ndarray, spacing: float, albedo: np.ndarray
-) -> _Body:
-    """Overlapping flat disks where `surface` holds, and smaller balls that stay hidden inside."""
-    flat, ball = np.array([0.66, 0.66, 0.15]) * spacing, np.full(3, 0.42 * spacing)
-    along = np.where(np.abs(normals[:, 2:]) > 0.9, np.array([1.0, 0.0, 0.0]), _UP)
-    scales = np.where(surface[:, None], flat, ball)
-    return _Body(means, _frames(normals, along), scales, albedo, np.full(len(means), 0.03))
-
-
-def _pot(rng: np.random.Generator) -> _Body:
+def _pot(rng: np.random.Generator) -> Body:
     """A tapered pot with a rim, two rings thick, filled with soil to below the rim."""
     layers, z = 15, np.linspace(0.005, 0.277, 15)
     radii = np.where(z > 0.22, 0.168, 0.118 + 0.035 * z / 0.22)
     radii[[0, -1]] -= 0.008  # rounded edges
-    axis = _Branch(z[:, None] * _UP, np.tile(_UP, (layers, 1)), radii)
+    axis = _Branch(z[:, None] * UP, np.tile(UP, (layers, 1)), radii)
     means, ring, layer = _sweep(axis, _POT_SPACING)
     bottom, top, above_soil = layer == 0, layer == layers - 1, layer > layers - 3
     wall = (ring < 2) | bottom
@@ -153,14 +119,16 @@ def _pot(rng: np.random.Generator) -> _Body:
     # Outwards on the side, inwards on its inner face, up or down elsewhere, and between at edges.
     vertical = 1.0 * (top | ground) - bottom
     horizontal = np.where(ring == 0, 1, np.where(vertical != 0, 0, 1 - 2 * inside))
-    outward = _unit(means * [1, 1, 0] + [1e-9, 0, 0])
-    normals = _unit(horizontal[:, None] * outward + vertical[:, None] * _UP)
+    outward = unit(means * [1, 1, 0] + [1e-9, 0, 0])
+    normals = unit(horizontal[:, None] * outward + vertical[:, None] * UP)
     surface = (ring == 0) | inside | (vertical != 0)
     # The soil is uneven in colour, and shifted against a too regular lattice.
     tone = np.where(wall, 1, rng.uniform(0.75, 1.3, len(means)))[:, None]
     means = means + np.where(wall[:, None], 0, rng.uniform(-0.004, 0.004, means.shape))
     albedo = tone * np.where(wall[:, None], _TERRACOTTA, _SOIL)
-    return _select(_solid(means, normals, surface, _POT_SPACING, albedo), wall | ~above_soil)
+    return select(
+        disks_and_balls(means, normals, surface, _POT_SPACING, albedo), wall | ~above_soil
+    )
 
 
 def _grow(
@@ -169,7 +137,7 @@ def _grow(
     """A branch from `start` whose direction and radius turn from one to the other value."""
     count = max(round(length / _WOOD_SPACING), 2) + 1
     t = np.linspace(0, 1, count)[:, None]
-    tangents = _unit((1 - t) * directions[0] + t * directions[1])
+    tangents = unit((1 - t) * directions[0] + t * directions[1])
     steps = length / (count - 1) * (tangents[1:] + tangents[:-1]) / 2
     points = start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     widths = radii[0] + (radii[1] - radii[0]) * t[:, 0]
@@ -179,7 +147,7 @@ def _grow(
 
 def _direction(azimuth: float, degrees: float) -> np.ndarray:
     """The unit vector of an azimuth in radians and an elevation in degrees."""
-    return _unit(np.array([math.cos(azimuth), math.sin(azimuth), math.tan(math.radians(degrees))]))
+    return unit(np.array([math.cos(azimuth), math.sin(azimuth), math.tan(math.radians(degrees))]))
 
 
 def _tree(rng: np.random.Generator) -> list[_Branch]:
@@ -217,7 +185,7 @@ def _depth_inside(points: np.ndarray, branches: Sequence[_Branch]) -> np.ndarray
     return depth
 
 
-def _wood(branches: Sequence[_Branch], rng: np.random.Generator) -> _Body:
+def _wood(branches: Sequence[_Branch], rng: np.random.Generator) -> Body:
     """Filled branches; what lies inside an earlier one, or too near to its points, is left out."""
     bodies, earlier = [], np.empty((0, 3))
     for i, branch in enumerate(branches):
@@ -227,16 +195,16 @@ def _wood(branches: Sequence[_Branch], rng: np.random.Generator) -> _Body:
             kept &= KDTree(earlier).query(means)[0] > 0.55 * _WOOD_SPACING
         normals = means - branch.points[place] + 1e-6 * branch.tangents[place]
         tip = place == len(branch.points) - 1
-        normals = _unit(_unit(normals) + np.where(tip[:, None], branch.tangents[place], 0))
+        normals = unit(unit(normals) + np.where(tip[:, None], branch.tangents[place], 0))
         # Bark in darker and lighter bands, and green towards the tips of the branches.
         bands = rng.uniform(0.9, 1.1, len(branch.points))[place]
         tone = bands * rng.uniform(0.93, 1.07, len(means))
         young = (i > 0) * 0.6 * (place / place.max())[:, None]
         albedo = tone[:, None] * ((1 - young) * _BARK + young * _DARK_GREEN)
-        body = _solid(means, normals, (ring == 0) | tip, _WOOD_SPACING, albedo)
-        bodies.append(_select(body, kept))
+        body = disks_and_balls(means, normals, (ring == 0) | tip, _WOOD_SPACING, albedo)
+        bodies.append(select(body, kept))
         earlier = np.concatenate([earlier, means[kept]])
-    return _Body(*_join(bodies))
+    return Body(*join(bodies))
 
 
 def _buds(
@@ -246,27 +214,27 @@ def _buds(
 
     They go around each branch by the golden angle, as leaves do, and are denser near its tip.
     """
-    points, tangents, radii = _join(branches)
+    points, tangents, radii = join(branches)
     counts = np.array([len(branch.points) for branch in branches])
     ends = np.cumsum(counts)
     number = np.arange(_LEAVES)
     owner = np.searchsorted(ends, (number + 0.5) / _LEAVES * ends[-1])
     from_tip = np.rint(0.8 * rng.uniform(0, 1, _LEAVES) ** 1.8 * (counts[owner] - 1)).astype(int)
     place, angle = ends[owner] - 1 - from_tip, number[:, None] * _GOLDEN_ANGLE
-    e1 = _unit(np.cross(tangents[place], [0.9, 0.4, 0.0]))
+    e1 = unit(np.cross(tangents[place], [0.9, 0.4, 0.0]))
     normals = np.cos(angle) * e1 + np.sin(angle) * np.cross(tangents[place], e1)
     places = points[place] + radii[place, None] * normals
-    outward = _unit(places - [0, 0, 0.6])
+    outward = unit(places - [0, 0, 0.6])
     # At the tip of a branch stalks go on along it.
     sideways = np.where(from_tip[:, None] > 0, 1, 0.5) * normals
-    stalks = _unit(sideways + 0.5 * tangents[place] + 0.5 * outward + 0.15 * _UP)
+    stalks = unit(sideways + 0.5 * tangents[place] + 0.5 * outward + 0.15 * UP)
     wander = rng.normal(0, 0.3, places.shape)
-    return places, stalks, _unit(0.8 * stalks + 0.8 * outward - 0.1 * _UP + wander)
+    return places, stalks, unit(0.8 * stalks + 0.8 * outward - 0.1 * UP + wander)
 
 
 def _leaves(
     places: np.ndarray, stalks: np.ndarray, blades: np.ndarray, rng: np.random.Generator
-) -> _Body:
+) -> Body:
     """Leaves: a stalk, then pairs of disks left and right of a light midrib on a blade bent down.
 
     The blade is an arc in the plane of its direction d and normal n: with the angle β over its
@@ -278,8 +246,8 @@ def _leaves(
         rng.uniform(low, high, (n, 1, 1))
         for low, high in ((0.09, 0.115), (0.024, 0.029), (0.4, 1.0), (0.010, 0.0135))
     )
-    up = _unit(_UP + rng.normal(0, 0.35, blades.shape) + 0.4 * _unit(places - [0, 0, 0.65]))
-    across = _unit(np.cross(up, blades))[:, None]
+    up = unit(UP + rng.normal(0, 0.35, blades.shape) + 0.4 * unit(places - [0, 0, 0.65]))
+    across = unit(np.cross(up, blades))[:, None]
     d, normal, stalk = blades[:, None], np.cross(blades, across[:, 0])[:, None], stalks[:, None]
 
     s, side, half = _LEAF_S[:, None], _LEAF_SIDE[:, None], np.abs(_LEAF_SIDE[:, None])
@@ -297,8 +265,8 @@ def _leaves(
 
     # Disks follow the middle of their half of the blade; stalks are round.
     along = np.where(is_stalk, stalk, tangent + 0.5 * slope * sideways)
-    flat = _unit(np.cross(along, np.cross(upward - fold * side * across, along)))
-    axes = _frames(flat.reshape(-1, 3), along.reshape(-1, 3))
+    flat = unit(np.cross(along, np.cross(upward - fold * side * across, along)))
+    own = axes(flat.reshape(-1, 3), along.reshape(-1, 3))
     length = np.where(is_stalk, 0.6 * gap, np.where(is_rib, 0.11, 0.125) * L)
     breadth = np.where(is_rib, 0.0016, np.where(half > 0, 0.40, 0.33) * w)
     thickness = np.where(is_stalk, 0.0016, 0.0012) + 0 * w
@@ -309,41 +277,4 @@ def _leaves(
     green = _DARK_GREEN + lightness * (_LIGHT_GREEN - _DARK_GREEN)
     green = green * rng.uniform(0.8, 1.15, (n, 1, 1))
     albedo = np.where(is_rib, 0.55 * _MIDRIB + 0.45 * green, green).reshape(-1, 3)
-    return _Body(means.reshape(-1, 3), axes, scales, albedo, np.full(len(albedo), 0.12))
-
-
-def _transmittance(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Light that reaches points from a direction, through balls that widen along a cone.
-
-    `T = exp(−Σ ρ a Δt / 2)`, with ρ the Gaussians per volume in a ball, a the area of one of them,
-    and Δt the diameter of the ball.
-    """
-    tree, area, depth = KDTree(points), 1.5e-4, np.zeros(len(points))
-    for distance, radius in ((0.07, 0.03), (0.15, 0.05), (0.27, 0.07)):
-        count = tree.query_ball_point(points + distance * direction, radius, return_length=True)
-        depth += count / (4 / 3 * math.pi * radius**3) * area * 2 * radius / 2
-    return np.exp(-depth)
-
-
-def _lit(body: _Body) -> Gaussians:
-    """Bake the light into the harmonics: sky and sun at degree 0, gloss at degree 1.
-
-    `c(d) = c₀ + g (r · −d)` with r the mirror image of the sun, for the viewing direction d.
-    """
-    normal = body.frames[..., 2]
-    facing = normal @ _LIGHT
-    # Seen from either side, and a little light passes through.
-    sun = np.maximum(facing + 0.25, 0) / 1.25 + 0.3 * np.maximum(-facing, 0) * (body.gloss > 0.1)
-    sky = (0.75 + 0.25 * normal[:, 2]) * _transmittance(body.means, _UP)
-    sunlight = 0.85 * sun * _transmittance(body.means, _LIGHT)
-    light = 0.3 + 0.5 * sky[:, None] + sunlight[:, None] * np.array([1.0, 0.97, 0.88])
-    color = np.clip(body.albedo * light, 0.02, 1.0)
-    mirror = 2 * facing[:, None] * normal - _LIGHT
-    strength = (body.gloss * (0.2 + sunlight))[:, None, None] * np.ones(3)
-    c0, c1 = math.sqrt(1 / (4 * math.pi)), math.sqrt(3 / (4 * math.pi))
-    # The basis at degree 1 is c1 (−y, z, −x).
-    linear = mirror[:, [1, 2, 0]] * [1, -1, 1] / c1
-    sh = np.concatenate([(color[:, None] - 0.5) / c0, linear[:, :, None] * strength], axis=1)
-    quaternions = np.roll(Rotation.from_matrix(body.frames).as_quat(), 1, axis=-1)
-    parts = (body.means, quaternions, body.scales, np.full(len(normal), 0.95), sh)
-    return Gaussians.from_scales(*(jnp.asarray(part, dtype=float) for part in parts))
+    return Body(means.reshape(-1, 3), own, scales, albedo, np.full(len(albedo), 0.12))

@@ -1,0 +1,13 @@
+"""Scenes made by a program instead of a camera: Gaussians that are also particles of a solid.
+
+Every body is filled throughout its volume, so that its Gaussians can be simulated as they are.
+Lengths are in metres and z points up.
+"""
+
+from collections.abc import Callable
+
+from pgjax.render.gaussians import Gaussians
+from pgjax.scenes.procedural.ficus import ficus
+
+MODELS: dict[str, Callable[[int, float], Gaussians]] = {"ficus": ficus}
+"""The models by name: functions of a seed and of the detail, 2 for Gaussians half as far apart."""
