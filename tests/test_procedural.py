@@ -12,12 +12,12 @@ from scipy.spatial import KDTree
 
 from pgjax.render import Camera, deform, render
 from pgjax.scenes.procedural import MODELS
-from pgjax.scenes.procedural import ficus as procedural
-from pgjax.scenes.procedural.ficus import ficus
+from pgjax.scenes.procedural.bodies import join
+from pgjax.scenes.procedural.ficus import _LEAF_S, _LEAVES, _STALK, _tree, _wood, ficus
 
 SEEDS = (0, 1, 2)
-PER_LEAF = len(procedural._LEAF_S)
-IN_LEAVES = procedural._LEAVES * PER_LEAF
+PER_LEAF = len(_LEAF_S)
+IN_LEAVES = _LEAVES * PER_LEAF
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -110,7 +110,7 @@ def test_leaves_hang_on_stalks_that_begin_at_a_branch(plant):
     leaves = means[-IN_LEAVES:].reshape(-1, PER_LEAF, 3)
     assert KDTree(means[:-IN_LEAVES]).query(leaves[:, 0])[0].max() < 0.02
     # The stalk and the first Gaussian of the blade.
-    gaps = np.linalg.norm(np.diff(leaves[:, : procedural._STALK + 1], axis=1), axis=-1)
+    gaps = np.linalg.norm(np.diff(leaves[:, : _STALK + 1], axis=1), axis=-1)
     assert gaps.max() < 0.015
     assert max(components(leaf, 0.025) for leaf in leaves) == 1
 
@@ -127,14 +127,14 @@ def test_the_pot_is_filled(plant):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_branches_are_filled_and_thick_enough_for_the_grid(seed):
     rng = np.random.default_rng(seed)
-    branches = procedural._tree(rng)
+    branches = _tree(rng)
     assert min(branch.radii[:-1].min() for branch in branches) > 0.02
-    points, tangents, radii = procedural._join(branches)
+    points, tangents, radii = join(branches)
     # Places anywhere in the cross sections.
     offset = np.cross(tangents, rng.normal(size=(20, *points.shape)))
     offset *= rng.uniform(0, 1, (20, len(points), 1)) / np.linalg.norm(offset, axis=-1)[..., None]
     inside = (points + radii[:, None] * offset).reshape(-1, 3)
-    wood = procedural._wood(branches, rng)
+    wood = _wood(branches, rng)
     assert KDTree(wood.means).query(inside)[0].max() < 0.02
 
 
