@@ -9,9 +9,7 @@ import equinox as eqx
 import pgjax
 
 MODULES = [
-    importlib.import_module(info.name)
-    for info in pkgutil.walk_packages(pgjax.__path__, "pgjax.")
-    if info.name != "pgjax.cli"
+    importlib.import_module(info.name) for info in pkgutil.walk_packages(pgjax.__path__, "pgjax.")
 ]
 
 
