@@ -82,7 +82,14 @@ def pictured(channel, views=1, frames=4, unknowns=None):
 
 
 @float64
-@pytest.mark.parametrize(("channel", "views"), [("rgb", 2), ("silhouette", 1), ("depth", 1)])
+@pytest.mark.parametrize(
+    ("channel", "views"),
+    [
+        ("rgb", 2),
+        pytest.param("silhouette", 1, marks=pytest.mark.slow),
+        pytest.param("depth", 1, marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_of_pictures(channel, views):
     problem = pictured(channel, views, frames=5)
     check = gradient_check(problem, steps=(1e-4, 1e-5, 1e-6))
@@ -134,6 +141,7 @@ def test_squares_are_averages():
 
 
 @float64
+@pytest.mark.slow
 def test_squares_lead_where_pixels_do_not():
     """A body seen far from where it is: through squares a step ends much nearer."""
     unknowns = parameters(
@@ -184,7 +192,11 @@ def cloud_problem(matching, count=60):
 
 @float64
 @pytest.mark.parametrize(
-    ("matching", "error"), [(Chamfer(), 1e-6), (Sinkhorn(0.02, iterations=200), 1e-2)]
+    ("matching", "error"),
+    [
+        (Chamfer(), 1e-6),
+        pytest.param(Sinkhorn(0.02, iterations=200), 1e-2, marks=pytest.mark.slow),
+    ],
 )
 def test_fit_without_correspondence(matching, error):
     problem = cloud_problem(matching)

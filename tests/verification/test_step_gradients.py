@@ -122,7 +122,11 @@ def all_finite(tree):
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
-@pytest.mark.parametrize(("d", "degree"), [(3, 2), (2, 3)], ids=["3d-quadratic", "2d-cubic"])
+@pytest.mark.parametrize(
+    ("d", "degree"),
+    [(3, 2), pytest.param(2, 3, marks=pytest.mark.slow)],
+    ids=["3d-quadratic", "2d-cubic"],
+)
 def test_step_derivatives(d, degree, measure):
     """G1: one step of every law from rest, rotation, equal stretches, flow, tip, compression."""
     problem = step_problem(d, degree)
