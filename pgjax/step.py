@@ -12,20 +12,8 @@ from pgjax import native
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Scalar
 from pgjax.boundary import AbstractGridCondition, Box, Particles, Region, sweep
-from pgjax.exchange import (
-    EVENTS,
-    Receiver,
-    Sender,
-    embed,
-    is_finite,
-    known,
-    receive,
-    receive_natively,
-    send,
-    send_natively,
-    velocities,
-    where,
-)
+from pgjax.exchange import EVENTS, Receiver, Sender, embed, is_finite, receive, send, where
+from pgjax.fused import known, receive_natively, send_natively, velocities
 from pgjax.grid import Grid
 from pgjax.models.law import AbstractElasticity, Response
 from pgjax.models.material import Material, cast, particle_axes

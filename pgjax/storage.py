@@ -9,30 +9,24 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import math
 import os
 import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pgjax._archive import FORMAT, NUMBERS, VERSION, Entry, Found, opened
 from pgjax._files import replacing, with_suffix
 from pgjax._types import concrete
 from pgjax.scene import Scene, initial_state
 from pgjax.simulate import Trajectory
 from pgjax.state import State
-
-_FORMAT = "format"
-_VERSION = 1
-# Kinds of dtype that `.npy` stores as they are: bool, integers, floats, complex numbers.
-_NUMBERS = "biufc"
-_LONGEST_FORMAT = 256
 
 
 def save_state(path: str | os.PathLike[str], state: State) -> None:
@@ -70,7 +64,7 @@ def load_state(path: str | os.PathLike[str], scene: Scene) -> State:
         ValueError: the file is missing, damaged, of another version or another scene, or in
             double precision where that is switched off.
     """
-    with _opened(path, "state") as found:
+    with opened(path, "state") as found:
         like = _matching(found, scene)
         _require_origin(found, scene, np.dtype(like.origin.dtype))
         leaves = [jnp.asarray(found.read(name)) for name in _entries(like)]
@@ -100,7 +94,7 @@ def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> Non
             f"a batch with times of shape {arrays['t'].shape}: save each member."
         )
     for name, array in _leaves("trajectory", trajectory.saved, "saved").items():
-        free = name if name not in arrays and name != _FORMAT else f"saved.{name}"
+        free = name if name not in arrays and name != FORMAT else f"saved.{name}"
         if free in arrays:
             raise ValueError(
                 f"Argument `trajectory` must have saved values with different names, but two are "
@@ -116,7 +110,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     Raises:
         ValueError: the file is missing, damaged, of another version, or not a trajectory.
     """
-    with _opened(path, "trajectory") as found:
+    with opened(path, "trajectory") as found:
         if "t" not in found.entries or len(found.entries["t"].shape) != 1:
             raise found.refused("have times `t`, one for each frame", "has none")
         frames = found.entries["t"].shape
@@ -202,7 +196,7 @@ def _content(value: Any) -> Iterator[bytes]:
 
 
 def _write(path: str | os.PathLike[str], kind: str, arrays: Mapping[str, np.ndarray]) -> None:
-    save_arrays(path, {_FORMAT: np.asarray(f"pgjax {kind} {_VERSION}"), **arrays})
+    save_arrays(path, {FORMAT: np.asarray(f"pgjax {kind} {VERSION}"), **arrays})
 
 
 def _leaves(argument: str, tree: Any, alone: str = "") -> dict[str, np.ndarray]:
@@ -232,7 +226,7 @@ def _numbers(argument: str, name: str, leaf: Any) -> np.ndarray:
             f"Argument `{argument}` must hold numbers, but `{name}` is being traced: save it "
             f"outside of `jit`, `grad` and `vmap`."
         )
-    if known is None or known.dtype.kind not in _NUMBERS:
+    if known is None or known.dtype.kind not in NUMBERS:
         raise ValueError(
             f"Argument `{argument}` must hold arrays of numbers, but `{name}` is "
             f"{getattr(leaf, 'dtype', type(leaf).__name__)}: convert it first."
@@ -245,107 +239,7 @@ def _is_key(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-class _Entry(NamedTuple):
-    """An array of a file as its header describes it."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-
-
-class _Found(NamedTuple):
-    """An open file whose headers have been read and fit the size of what follows them."""
-
-    file: Path
-    archive: zipfile.ZipFile
-    entries: dict[str, _Entry]
-
-    def refused(self, rule: str, fault: str) -> ValueError:
-        """The error of a file that breaks a rule."""
-        return ValueError(f"The file {self.file} must {rule}, but {fault}.")
-
-    def read(self, name: str) -> np.ndarray:
-        """The array of a name; the checksum is compared on the way."""
-        with _naming(self.file), self.archive.open(f"{name}.npy") as stream:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-            # The checksum is known at the end only.
-            stream.read(1)
-        return array
-
-
-@contextlib.contextmanager
-def _opened(path: str | os.PathLike[str], kind: str) -> Iterator[_Found]:
-    """Open a file and read its headers, no more."""
-    file = Path(path)
-    if not file.is_file():
-        raise ValueError(f"There is no file {file}.")
-    with _naming(file):
-        archive = zipfile.ZipFile(file)
-    with archive:
-        entries = {}
-        for info in archive.infolist():
-            name = info.filename.removesuffix(".npy")
-            if name in entries:
-                raise _damaged(file, f"`{name}` is there twice")
-            entries[name] = _entry(file, archive, info)
-        found = _Found(file, archive, entries)
-        _require_kind(found, kind)
-        del entries[_FORMAT]
-        for name, entry in entries.items():
-            if entry.dtype.kind not in _NUMBERS:
-                raise found.refused("hold numbers only", f"`{name}` is of type {entry.dtype}")
-        yield found
-
-
-def _entry(file: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Entry:
-    """What the header of an array says, compared with the room there is for it in the file."""
-    room = file.stat().st_size - info.header_offset
-    if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-        raise _damaged(file, f"`{info.filename}` is compressed, which pgjax never does")
-    if not 0 <= info.file_size <= room:
-        raise _damaged(
-            file, f"`{info.filename}` claims {info.file_size} bytes where {room} are left"
-        )
-    with _naming(file), archive.open(info) as stream:
-        shape, dtype, header = _array_header(stream)
-    size = math.prod(shape) * dtype.itemsize
-    if min(shape, default=0) < 0 or (header + size != info.file_size and not dtype.hasobject):
-        raise _damaged(
-            file,
-            f"`{info.filename}` claims the shape {shape}, but holds {info.file_size} bytes",
-        )
-    return _Entry(shape, dtype)
-
-
-def _array_header(stream: Any) -> tuple[tuple[int, ...], np.dtype, int]:
-    """Shape, dtype and length of the header of a `.npy`."""
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-    elif version == (2, 0):
-        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
-    else:
-        raise ValueError(f"version {version} of .npy is unknown")
-    return shape, dtype, stream.tell()
-
-
-def _require_kind(found: _Found, kind: str) -> None:
-    """Raise unless the file says that it is what is wanted, of the version known here."""
-    entry = found.entries.get(_FORMAT)
-    text = ""
-    if entry and entry.dtype.kind == "U" and not entry.shape:
-        text = str(found.read(_FORMAT)) if entry.dtype.itemsize <= _LONGEST_FORMAT else ""
-    match = re.fullmatch(r"pgjax (\w+) (\d+)", text)
-    if match is None:
-        raise found.refused(f"be a {kind} written by pgjax", "does not say that it is")
-    if match[1] != kind:
-        raise found.refused(f"hold a {kind}", f"holds a {match[1]}")
-    if int(match[2]) != _VERSION:
-        raise found.refused(
-            f"be of version {_VERSION}, the one this pgjax reads", f"is of version {match[2]}"
-        )
-
-
-def _matching(found: _Found, scene: Scene) -> State:
+def _matching(found: Found, scene: Scene) -> State:
     """Shapes and types of a state of the scene; raises unless the file has just these."""
     velocity = found.entries.get("v")
     if velocity is None or len(velocity.shape) != 2:
@@ -370,15 +264,15 @@ def _matching(found: _Found, scene: Scene) -> State:
     return like
 
 
-def _entries(like: State) -> dict[str, _Entry]:
+def _entries(like: State) -> dict[str, Entry]:
     """The arrays of a state by name, in the order of its leaves."""
     return {
-        _name(path): _Entry(leaf.shape, np.dtype(leaf.dtype))
+        _name(path): Entry(leaf.shape, np.dtype(leaf.dtype))
         for path, leaf in jax.tree_util.tree_leaves_with_path(like)
     }
 
 
-def _require_precision(found: _Found, dtype: np.dtype) -> None:
+def _require_precision(found: Found, dtype: np.dtype) -> None:
     if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise found.refused("be in float32 or float64", f"is in {dtype}")
     if dtype == np.float64 and jnp.zeros(()).dtype != np.float64:
@@ -389,7 +283,7 @@ def _require_precision(found: _Found, dtype: np.dtype) -> None:
         )
 
 
-def _require_names(found: _Found, expected: Mapping[str, _Entry]) -> None:
+def _require_names(found: Found, expected: Mapping[str, Entry]) -> None:
     missing, extra = expected.keys() - found.entries.keys(), found.entries.keys() - expected.keys()
     if not missing and not extra:
         return
@@ -403,7 +297,7 @@ def _require_names(found: _Found, expected: Mapping[str, _Entry]) -> None:
     raise found.refused("be of a scene with the same materials", " and ".join(faults) + hint)
 
 
-def _require_origin(found: _Found, scene: Scene, dtype: np.dtype) -> None:
+def _require_origin(found: Found, scene: Scene, dtype: np.dtype) -> None:
     """Positions are relative to the origin: with another one they would be somewhere else."""
     origin = concrete(scene.grid.origin)
     if origin is None:
@@ -421,20 +315,3 @@ def _like(scene: Scene, dtype: np.dtype) -> State:
 
 def _listed(names: Any) -> str:
     return ", ".join(f"`{name}`" for name in sorted(names))
-
-
-def _damaged(file: Path, fault: Any) -> ValueError:
-    return ValueError(
-        f"The file {file} must be a complete .npz, but is truncated or damaged: {fault}."
-    )
-
-
-@contextlib.contextmanager
-def _naming(file: Path) -> Iterator[None]:
-    """Whatever a damaged file makes the readers of zip and numpy raise, name the file."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise _damaged(file, str(error).rstrip(".") or type(error).__name__) from error

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pgjax
-from pgjax import boundary, exchange, models, native
+from pgjax import boundary, fused, models, native
 from pgjax.exchange import Receiver, Sender
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="there are no native kernels")
@@ -137,8 +137,8 @@ def receive_case(mapping, d, degree, mls, each):
 def test_send_is_what_it_says(law, d, degree, mls):
     # Parameters of each particle, or of all, with every law in two and three dimensions.
     operands, static = send_case(law, d, degree, mls, each=(d == 2) == mls)
-    native_one = functools.partial(exchange._send, **static)
-    plain = functools.partial(exchange._send_plain, **static)
+    native_one = functools.partial(fused._send, **static)
+    plain = functools.partial(fused._send_plain, **static)
     close(native_one(*operands), jax.jit(plain)(*operands), 100 * EPS)
     if DOUBLE:
         close(pulled(native_one, 2, operands), pulled(plain, 2, operands), 1e-9)
@@ -149,8 +149,8 @@ def test_send_is_what_it_says(law, d, degree, mls):
 def test_receive_is_what_it_says(mapping, d, degree, mls):
     # Parameters of each particle, or of all, with every map in two and three dimensions.
     operands, static = receive_case(mapping, d, degree, mls, each=(d == 2) == mls)
-    native_one = functools.partial(exchange._receive, **static)
-    plain = functools.partial(exchange._receive_plain, **static)
+    native_one = functools.partial(fused._receive, **static)
+    plain = functools.partial(fused._receive_plain, **static)
     close(native_one(*operands), jax.jit(plain)(*operands), 300 * EPS)
     if DOUBLE:
         close(pulled(native_one, 3, operands), pulled(plain, 3, operands), 1e-9)
@@ -179,8 +179,8 @@ def grid_case(contact, d, seed=7):
 @pytest.mark.parametrize("contact", CONTACTS)
 def test_velocities_are_what_they_say(contact, d):
     operands, static = grid_case(contact, d)
-    native_one = functools.partial(exchange._velocities, **static)
-    plain = functools.partial(exchange._velocities_plain, **static)
+    native_one = functools.partial(fused._velocities, **static)
+    plain = functools.partial(fused._velocities_plain, **static)
     close(native_one(*operands), jax.jit(plain)(*operands), 100 * EPS)
     close(pulled(native_one, 3, operands), pulled(plain, 3, operands), 1000 * EPS)
     close(moved(native_one, 3, operands), moved(plain, 3, operands), 1000 * EPS)
@@ -249,13 +249,11 @@ def test_inside_shard_map():
     *own, mu, lam, numbers = operands
 
     def total(mu, *own):
-        grid = exchange._send(*own, mu, lam, numbers, **static)[0]
+        grid = fused._send(*own, mu, lam, numbers, **static)[0]
         return jax.lax.psum(jnp.sum(grid**2), "b")
 
     sharded = jax.shard_map(total, mesh=mesh, in_specs=(P(), *[P("b")] * len(own)), out_specs=P())
-    plain = jnp.sum(exchange._send(*operands, **static)[0] ** 2)
+    plain = jnp.sum(fused._send(*operands, **static)[0] ** 2)
     np.testing.assert_allclose(sharded(mu, *own), plain, rtol=1e-5)
-    slope = jax.grad(lambda mu: jnp.sum(exchange._send(*own, mu, lam, numbers, **static)[0] ** 2))(
-        mu
-    )
+    slope = jax.grad(lambda mu: jnp.sum(fused._send(*own, mu, lam, numbers, **static)[0] ** 2))(mu)
     np.testing.assert_allclose(jax.grad(sharded)(mu, *own), slope, rtol=1e-4)

@@ -13,8 +13,8 @@ from pgjax.models.material import Material as Material
 from pgjax.models.plasticity import AbstractHenckyPlasticity as AbstractHenckyPlasticity
 from pgjax.models.plasticity import AbstractPlasticity as AbstractPlasticity
 from pgjax.models.plasticity import DruckerPrager as DruckerPrager
-from pgjax.models.plasticity import HerschelBulkley as HerschelBulkley
 from pgjax.models.plasticity import VonMises as VonMises
 from pgjax.models.snow import CriticalStretches as CriticalStretches
 from pgjax.models.snow import Snow as Snow
+from pgjax.models.viscoplasticity import HerschelBulkley as HerschelBulkley
 from pgjax.models.viscous import KelvinVoigt as KelvinVoigt

@@ -17,8 +17,9 @@ from pgjax._safe import safe_divide, safe_norm
 from pgjax._types import Array, Bool, Matrix3, Scalar, Vector3, parameter
 from pgjax.linalg import det, isotropic, polar, svd
 from pgjax.models.elasticity import AbstractElasticity, DevVolNeoHookean, FixedCorotated, StVKHencky
-from pgjax.models.plasticity import AbstractPlasticity, DruckerPrager, HerschelBulkley, VonMises
+from pgjax.models.plasticity import AbstractPlasticity, DruckerPrager, VonMises
 from pgjax.models.strain import SMALLEST_STRETCH, SMALLEST_VOLUME_RATIO, identity
+from pgjax.models.viscoplasticity import HerschelBulkley
 
 _ROOT_2_3 = (2 / 3) ** 0.5
 
