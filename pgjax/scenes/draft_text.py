@@ -1,5 +1,6 @@
 """The text of a drafted scene file: each choice with the number it was made by."""
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -126,17 +127,18 @@ def _head(ply: str, name: str, findings: Findings) -> list[str]:
         f"# Drafted by `pgjax init` from {_plain(Path(ply).name)}. Each guess is explained beside",
         "# it: change what is wrong, look at it with `pgjax preview`, then `pgjax run` it.",
         "#",
-        f"# {findings.total} Gaussians, {seen} of them above the opacity {OPACITY_ABOVE:g}, "
-        f"in the box",
-        f"# {box} (capture), without {findings.floaters} far outside.",
+        *_comment(
+            f"{findings.total} Gaussians, {seen} of them above the opacity {OPACITY_ABOVE:g}, in "
+            f"the box {box} (capture), without {findings.floaters} far outside."
+        ),
         _assign("name", _plain(name)),
     ]
 
 
 def _model(ply: str, findings: Findings, choices: Choices, made: Plan | None) -> list[str]:
     lines = ["", "[model]", _assign("ply", ply)]
-    lines += [f"# Up: {up_in_words(findings)}.", f"up = {_list(findings.up)}"]
-    lines.append(f"# The object: {object_in_words(findings)}.")
+    lines += [*_comment(f"Up: {up_in_words(findings)}."), f"up = {_list(findings.up)}"]
+    lines += _comment(f"The object: {object_in_words(findings)}.")
     if findings.region is not None:
         lines += [
             "# Coordinates of the capture. Larger or smaller, it takes more or less with it;",
@@ -146,26 +148,24 @@ def _model(ply: str, findings: Findings, choices: Choices, made: Plan | None) ->
     lines += [
         "# Longest side, m. Captures have no units: smaller things move faster.",
         f"size = {choices.size:g}",
-        f"# Ground: {ground_in_words(findings)}.",
-        "# It is z = 0 of the simulation; the third number is the height of the foot above it.",
+        *_comment(
+            f"Ground: {ground_in_words(findings)}. It is z = 0 of the simulation; the third "
+            f"number is the height of the foot above it."
+        ),
         f"position = [0, 0, {choices.hover:g}]",
     ]
-    long = (
-        f"# {100 * choices.needles:.1f} % of the Gaussians are longer than half a spacing of the "
-        f"grid"
-    )
-    if choices.split:
-        lines += [f"{long}: they are split, so that they bend.", f"split_longer_than = {NEEDLE:g}"]
-    else:
-        lines += [f"{long}: left whole.", f"# split_longer_than = {NEEDLE:g}"]
-    for note in () if made is None else made.notes:
-        if note.startswith("filling: "):
-            lines.append(f"# {note.removeprefix('filling: ')}.")
-    if choices.fill:
-        lines += ["# The surface encloses an inside, which is filled with particles.", "fill = {}"]
-    else:
-        lines += ["# No inside to be filled was found.", "# fill = {}"]
-    return lines
+    share = 100 * choices.needles
+    what = "split, so that they bend" if choices.split else "left whole"
+    lines += [
+        *_comment(f"{share:.1f} % of the Gaussians are longer than half a cell: {what}."),
+        f"{'' if choices.split else '# '}split_longer_than = {NEEDLE:g}",
+    ]
+    if not choices.fill:
+        return [*lines, "# No inside to be filled was found.", "# fill = {}"]
+    notes = () if made is None else made.notes
+    found = [note.removeprefix("filling: ") for note in notes if note.startswith("filling: ")]
+    lines += _comment(f"The inside is filled with particles: {', '.join(found)}.")
+    return [*lines, "fill = {}"]
 
 
 def _region(region: AbstractRegion) -> str:
@@ -182,11 +182,11 @@ def _grid(choices: Choices, made: Plan | None) -> list[str]:
     lines = ["", "# Where it can move, m: the object, and room beside and above it.", "[grid]"]
     lines += [f"lower = {_list(choices.lower, 3)}", f"upper = {_list(choices.upper, 3)}"]
     if made is not None:
-        lines += [
-            f"# {choices.per_cell:.1f} Gaussians of the object in a cell that holds any; "
-            f"{made.scene.particle_count} particles in all.",
-            "# Half the spacing resolves finer motion and takes 2 (a surface) to 16 times as long.",
-        ]
+        lines += _comment(
+            f"{choices.per_cell:.1f} Gaussians of the object in a cell that holds any; "
+            f"{made.scene.particle_count} particles in all. Half the spacing resolves finer "
+            f"motion and takes 2 (a surface) to 16 times (a solid) as long."
+        )
     lines.append(f"spacing = {choices.spacing:g}")
     return lines
 
@@ -194,11 +194,10 @@ def _grid(choices: Choices, made: Plan | None) -> list[str]:
 def _time(made: Plan | None, seconds: float) -> list[str]:
     lines = ["", "[time]", f"frames = {_FRAMES}", f"fps = {_FPS}"]
     if made is not None:
-        lines += [
-            f"# {made.substeps} steps of {made.dt:.3g} s in a frame, chosen from the stiffness of "
-            f"the material. All",
-            f"# frames take about {_seconds(seconds)} on two cores.",
-        ]
+        lines += _comment(
+            f"{made.substeps} steps of {made.dt:.3g} s in a frame, from the stiffness of the "
+            f"material and the grid. All frames take about {_seconds(seconds)} on two cores."
+        )
     return [*lines, "", "[forces]", "gravity = [0, 0, -9.81]"]
 
 
@@ -250,6 +249,13 @@ def _camera(choices: Choices) -> list[str]:
 
 def _list(values: object, digits: int = 4) -> str:
     return "[" + ", ".join(f"{float(a) + 0.0:.{digits}g}" for a in np.asarray(values)) + "]"
+
+
+def _comment(text: str) -> list[str]:
+    """A text as lines of comment."""
+    return textwrap.wrap(
+        text, 98, initial_indent="# ", subsequent_indent="# ", break_long_words=False
+    )
 
 
 def _assign(key: str, value: str) -> str:

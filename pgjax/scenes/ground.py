@@ -129,7 +129,7 @@ def _could_be(x: np.ndarray, up: np.ndarray, height: float, thickness: float) ->
     d = x @ up - height
     inside = np.count_nonzero(np.abs(d) < thickness)
     below = np.count_nonzero(d <= -thickness)
-    return inside > 0.05 * len(x) and below < 0.5 * (len(x) - inside)
+    return bool(inside > 0.05 * len(x) and below < 0.5 * (len(x) - inside))
 
 
 def _judged(x: np.ndarray, up: np.ndarray, height: float, thickness: float) -> Ground:
@@ -145,7 +145,7 @@ def _judged(x: np.ndarray, up: np.ndarray, height: float, thickness: float) -> G
     def view(which: np.ndarray) -> np.ndarray:
         number = np.bincount(row[which] * cells + column[which], minlength=cells**2)
         there = np.pad(number.reshape(cells, cells) > 1, 1)
-        return ndimage.binary_fill_holes(ndimage.binary_closing(there))
+        return np.asarray(ndimage.binary_fill_holes(ndimage.binary_closing(there)), bool)
 
     whole, plane = view(np.ones(len(x), bool)), view(inside)
     return Ground(

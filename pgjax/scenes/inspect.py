@@ -142,8 +142,8 @@ def _connected(x: np.ndarray) -> np.ndarray:
     at = np.floor((x - x.min(axis=0)) / voxel).astype(int)
     filled = np.zeros(at.max(axis=0) + 1, bool)
     filled[tuple(at.T)] = True
-    labels: Any = ndimage.label(filled, np.ones((3, 3, 3)))[0]
-    return labels[tuple(at.T)]
+    labelled: Any = ndimage.label(filled, np.ones((3, 3, 3)))
+    return labelled[0][tuple(at.T)]
 
 
 def _beside(x: np.ndarray, label: np.ndarray, main: int, up: np.ndarray) -> list[int]:

@@ -20,7 +20,7 @@ from pgjax.boundary.shapes import normal
 from pgjax.scenes.build import Plan
 
 # Points of all particles, of each material at least, of what is marked, of what does not move.
-_PARTICLES, _FEWEST, _MARKED, _STILL = 6000, 200, 300, 2500
+_PARTICLES, _FEWEST, _MARKED, _STILL = 6000, 200, 120, 2500
 # Nodes of the lattice walls are found on, along the longest side; half a shell in its spacings.
 _NODES, _SHELL = 40, 0.6
 # How much further than the grid a wall that moves is looked for, in extents of the grid.
@@ -49,7 +49,7 @@ class Mark(NamedTuple):
     data: np.ndarray
     colour: str
     marker: str = "."
-    size: float = 2.0
+    size: float = 2.5
     alpha: float = 1.0
     outside: bool = False
 
@@ -201,7 +201,8 @@ def _path(at: Callable[[Any], Any], x: np.ndarray, start: float, end: float) -> 
 
 def _conditions(plan: Plan) -> Iterator[Mark]:
     x = _positions(plan)
-    for condition in plan.scene.particle_conditions:
+    conditions: tuple[Any, ...] = plan.scene.particle_conditions
+    for condition in conditions:
         mask = np.ones(len(x), bool) if condition.mask is None else np.asarray(condition.mask)
         rows = np.flatnonzero(mask)
         middle = x[rows].mean(axis=0) if len(rows) else x.mean(axis=0)
@@ -232,7 +233,7 @@ def _led(
             until = " and released one after the other"
     colour = "magenta" if moves else "black"
     label = f"{'led' if moves else 'held'}{until}: {count} particles"
-    yield Mark(label, "points", x, colour, marker="x", size=3.5, alpha=0.7)
+    yield Mark(label, "points", x, colour, marker="x", size=3.5)
     if moves:
         yield Mark("way of what moves", "lines", path, "magenta", size=1.5)
 

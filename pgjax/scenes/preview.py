@@ -105,7 +105,7 @@ def _space(plan: Plan, found: list[Mark], axes: Any) -> None:
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     for name, a, b in zip(_NAMES, low, high, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
-    axes.set_box_aspect(high - low)
+    axes.set_box_aspect(high - low, zoom=1.15)
     axes.view_init(_ELEVATION, _AZIMUTH)
     axes.tick_params(labelsize=6, pad=-2)
     axes.set_title("with the camera", fontsize=9)
