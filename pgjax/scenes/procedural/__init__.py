@@ -7,7 +7,15 @@ Lengths are in metres and z points up.
 from collections.abc import Callable
 
 from pgjax.render.gaussians import Gaussians
+from pgjax.scenes.procedural.animals import fox, wolf
 from pgjax.scenes.procedural.ficus import ficus
+from pgjax.scenes.procedural.metal import can, plane
 
-MODELS: dict[str, Callable[[int, float], Gaussians]] = {"ficus": ficus}
+MODELS: dict[str, Callable[[int, float], Gaussians]] = {
+    "ficus": ficus,
+    "can": can,
+    "fox": fox,
+    "plane": plane,
+    "wolf": wolf,
+}
 """The models by name: functions of a seed and of the detail, 2 for Gaussians half as far apart."""
