@@ -1,0 +1,108 @@
+"""The stored results of the scenes: JSON, Markdown, and the gallery."""
+
+import datetime
+import json
+from pathlib import Path
+
+import imageio.v3 as iio
+import jax
+import numpy as np
+
+from benchmarks.speed.report import cpu
+from pgjax.scenes import Plan, presets, resolve
+
+COMMAND = "python -m benchmarks.scenes"
+_MOMENTS = (0, 1 / 3, 1)
+_LIMIT = 120.0
+
+
+def stored(path: Path) -> list[dict]:
+    """The rows of before."""
+    return json.loads(path.read_text())["rows"] if path.exists() else []
+
+
+def law(plan: Plan) -> str:
+    """The laws of a scene, each once."""
+    names = []
+    for material in plan.scene.materials:
+        flow = material.plasticity
+        names.append(type(material.law).__name__ + (f", {type(flow).__name__}" if flow else ""))
+    return "; ".join(dict.fromkeys(names))
+
+
+def is_green(row: dict) -> bool:
+    """Whether a scene ran in time and moved as it should."""
+    return row["seconds"] <= _LIMIT and all(check["holds"] for check in row["checks"])
+
+
+def line(row: dict) -> str:
+    """A row, for the terminal."""
+    checks = "; ".join(
+        f"{c['what']} {c['value']:.3g} ({c['demand']}{'' if c['holds'] else ', MISSED'})"
+        for c in row["checks"]
+    )
+    return f"{row['scene']}: {row['seconds']:.0f} s, {checks}"
+
+
+def write(path: Path, rows: list[dict]) -> None:
+    """The table, as JSON and as Markdown."""
+    machine = {
+        "cpu": cpu(),
+        "date": datetime.date.today().isoformat(),
+        "jax": jax.__version__,
+        "command": COMMAND,
+    }
+    path.write_text(json.dumps({**machine, "rows": rows}, indent=1) + "\n")
+    lines = [
+        "# Scenes",
+        "",
+        f"`{COMMAND}`; {machine['cpu']}, JAX {machine['jax']}, {machine['date']}. Each preset as "
+        f"`pgjax run` runs it, drawing included, and what is measured of its motion.",
+        "",
+        "| scene | laws | particles | steps | frames | seconds | measured | demanded | met |",
+        "|---|---|---:|---:|---:|---:|---|---|---|",
+    ]
+    for row in rows:
+        head = [row["scene"], row["law"], *(f"{row[k]}" for k in ("particles", "steps", "frames"))]
+        cells = [*head, f"{row['seconds']:.0f}"]
+        for check in row["checks"]:
+            met = "yes" if check["holds"] else "**no**"
+            what = f"{check['what']}: {check['value']:.3g}"
+            lines.append("| " + " | ".join([*cells, what, check["demand"], met]) + " |")
+            cells = [""] * len(cells)
+    said = [f"- {row['scene']}: {text}" for row in rows for text in row["warnings"]]
+    if said:
+        lines += ["", "Warnings of the runs:", "", *said]
+    path.with_suffix(".md").write_text("\n".join(lines) + "\n")
+
+
+def write_strip(path: Path, video: Path) -> None:
+    """Three moments of a video side by side."""
+    frames = np.asarray(iio.imread(video))
+    strip = np.concatenate([frames[round(m * (len(frames) - 1))] for m in _MOMENTS], axis=1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(path, strip[::2, ::2] if strip.shape[0] > 480 else strip)
+
+
+def write_gallery(docs: Path, rows: list[dict]) -> None:
+    """The page with a picture of each scene."""
+    lines = [
+        "# Gallery",
+        "",
+        f"The {len(presets())} scenes of PhysGaussian's supplement, as `pgjax run NAME` makes",
+        "them: the first frame, the one after a third of the time, and the last. Every model is",
+        "made by a program, so that each scene runs as it is; `--ply` puts a capture of your own",
+        "in its place, `--quality paper` takes the published resolution. What is measured of each",
+        f"motion is in [the table](../benchmarks/results/scenes_cpu.md). `{COMMAND}` writes both.",
+    ]
+    for row in rows:
+        lines += ["", f"## {row['scene']}", "", *_about(row["scene"]), ""]
+        lines += [f"![{row['scene']}](images/gallery/{row['scene']}.png)"]
+    (docs / "gallery.md").write_text("\n".join(lines) + "\n")
+
+
+def _about(name: str) -> list[str]:
+    """What the scene file says of itself: the comment at its top."""
+    text = resolve(name).read_text().splitlines()
+    end = next(i for i, line in enumerate(text) if not line.startswith("#"))
+    return [line.removeprefix("#").strip() for line in text[:end]]
