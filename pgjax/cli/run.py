@@ -13,13 +13,25 @@ from typing import TYPE_CHECKING, Any
 from pgjax.cli.folders import folders, next_folder
 
 if TYPE_CHECKING:
-    from pgjax.scenes import Plan
+    from pgjax.scenes import Plan, SceneFile
 
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser's."""
     run = commands.add_parser("run", help="simulate a scene and write a video of it")
-    run.add_argument("scene", help="name of a preset, or a scene file (.toml)")
+    run.add_argument("scene", nargs="?", help="name of a preset, or a scene file (.toml)")
+    run.add_argument(
+        "--physgaussian",
+        type=Path,
+        metavar="CONFIG",
+        help="a configuration file of PhysGaussian (.json) in place of the scene",
+    )
+    run.add_argument("--model", type=Path, help="with it: folder of the trained model, or its .ply")
+    run.add_argument(
+        "--legacy",
+        action="store_true",
+        help="with it: keep what published results owe to defects (see `pgjax convert`)",
+    )
     run.add_argument("--ply", type=Path, help="a captured scene in place of the scene's own model")
     run.add_argument(
         "--quality", help="one of the scene's own qualities, e.g. paper, in place of its default"
@@ -47,14 +59,14 @@ def add_to(commands: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     # Imported here: `pgjax --help` and errors in the arguments should not wait for JAX.
-    from pgjax.scenes import plan, read_scene, resolve, summary
+    from pgjax.scenes import plan, summary
     from pgjax.scenes.record import require_empty
 
     if options.frames is not None and options.frames < 1:
         raise ValueError(f"Argument `--frames` must be at least 1, but is {options.frames}.")
     if options.out is not None and not options.resume:
         require_empty(options.out)
-    file = read_scene(resolve(options.scene), options.quality)
+    file = _scene(options)
     name = file.name if options.quality is None else f"{file.name}-{options.quality}"
     folder, frames = options.out, options.frames
     if options.resume:
@@ -67,6 +79,35 @@ def _run(options: argparse.Namespace) -> int:
         _foretell(options, planned, folder)
         return 0
     return _simulate(options, planned, folder)
+
+
+def _scene(options: argparse.Namespace) -> "SceneFile":
+    """The scene, from its own file or from a configuration of PhysGaussian."""
+    from pgjax.scenes import read_scene, resolve
+
+    config = options.physgaussian
+    if config is None:
+        if options.scene is None:
+            raise ValueError("Argument `scene` must be given, or `--physgaussian`, but is missing.")
+        if options.model is not None or options.legacy:
+            name = "--legacy" if options.model is None else "--model"
+            raise ValueError(
+                f"Argument `{name}` must be left out without `--physgaussian`, but is given."
+            )
+        return read_scene(resolve(options.scene), options.quality)
+    for name in ("scene", "ply", "quality"):
+        if getattr(options, name) is not None:
+            raise ValueError(
+                f"Argument `{name}` must be left out with `--physgaussian`, but is "
+                f"{getattr(options, name)}."
+            )
+    if options.model is None:
+        raise ValueError("Argument `--model` must be given with `--physgaussian`, but is missing.")
+    from pgjax.scenes.physgaussian import convert
+
+    converted = convert(config, options.model, legacy=options.legacy)
+    print("\n".join(f"{'note':10} {note}" for note in converted.notes))
+    return converted.scene()
 
 
 def _simulate(options: argparse.Namespace, planned: "Plan", folder: Path) -> int:
@@ -158,8 +199,11 @@ def _go_on(options: argparse.Namespace, folder: Path) -> str:
     """The command that goes on with the run; the run itself remembers the rest."""
     ply = [] if options.ply is None else ["--ply", str(options.ply)]
     quality = [] if options.quality is None else ["--quality", options.quality]
-    how = ["pgjax", "run", options.scene, *ply, *quality, "--out", str(folder), "--resume"]
-    return shlex.join(how)
+    scene = [options.scene]
+    if options.physgaussian is not None:
+        scene = ["--physgaussian", str(options.physgaussian), "--model", str(options.model)]
+        scene += ["--legacy"] if options.legacy else []
+    return shlex.join(["pgjax", "run", *scene, *ply, *quality, "--out", str(folder), "--resume"])
 
 
 def _unfinished(options: argparse.Namespace, name: str) -> tuple[Path, int]:

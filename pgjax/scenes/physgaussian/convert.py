@@ -219,7 +219,11 @@ def _time(
         notes.append(f"frame_dt: {steps} steps of {dt:g} s a frame, so that it is {frame:g} s long")
     else:
         was = f" (the reference: {truncated})" if truncated != steps else ""
-        notes.append(f"frame_dt: {steps} steps of {frame / steps:.4g} s a frame{was}")
+        part = frame / steps / limit
+        notes.append(
+            f"frame_dt: {steps} steps of {frame / steps:.4g} s a frame{was}, {part:.2f} of the "
+            f"largest stable ones at rest"
+        )
     notes.append(f"frame_num: {config.frame_num} frames after a first one of the state of rest")
     return {"frames": config.frame_num, "fps": 1 / frame, "dt": dt}, notes
 

@@ -20,6 +20,8 @@ _CENTER = np.array([1.0, 1.0, 1.0])
 _AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 # A finer filling than this part of the grid's spacing adds particles and no detail.
 _FINEST_FILL = 0.5
+# So many times a filling that takes too many cells or particles is made coarser by a fifth.
+_COARSER = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,22 +149,42 @@ def _filled(config: Config, placed: Placed) -> Placed:
     if filling.boundary is not None:
         side = float(np.max(np.subtract(filling.boundary[1::2], filling.boundary[::2])))
     wanted = side / filling.n_grid / filling.per_cell ** (1 / 3)
-    spacing = max(wanted, _FINEST_FILL * grid)
-    fill = {"spacing": spacing, "max_particles": filling.max_particles, "seed": 0}
+    table = dict(placed.table)
+    x, spacing = _fitting(config, placed, table, max(wanted, _FINEST_FILL * grid))
     notes = [
         f"particle_filling: particles {spacing:.4g} m apart in every closed body, from seed 0; "
         f"more than {filling.max_particles} are an error, broken covariances count as points"
     ]
     if spacing > wanted:
-        notes.append(f"particle_filling: {wanted:.4g} m apart was finer than half a cell")
+        notes.append(
+            f"particle_filling: {wanted:.4g} m apart was finer than half a cell, or than what "
+            f"can be had"
+        )
     if filling.unused:
         notes.append(
             f"particle_filling: {', '.join(filling.unused)} not used: what a ball rolled over the "
             f"surface does not reach is inside"
         )
-    table = {**placed.table, "fill": fill}
-    part = Table(f"{config.source} [particle_filling]", table).read(model)
-    if placed.labels is not None:
-        part = dataclasses.replace(part, region=LabelRegion(placed.labels, (1,)))
-    x = np.asarray(body(part, grid).moving.means, np.float64)
     return Placed(table, placed.labels, x, placed.per_unit, notes)
+
+
+def _fitting(
+    config: Config, placed: Placed, table: dict[str, Any], spacing: float
+) -> tuple[np.ndarray, float]:
+    """The particles with a filling of this distance, or the next that can be had; adds it."""
+    assert config.filling is not None
+    tries = 0
+    while True:
+        fill = {"spacing": spacing, "max_particles": config.filling.max_particles, "seed": 0}
+        table["fill"] = fill
+        part = Table(f"{config.source} [particle_filling]", table).read(model)
+        if placed.labels is not None:
+            part = dataclasses.replace(part, region=LabelRegion(placed.labels, (1,)))
+        try:
+            filled = body(part, config.grid_lim / config.n_grid)
+            return np.asarray(filled.moving.means, np.float64), spacing
+        except SceneError as error:
+            tries += 1
+            if "`spacing`" not in str(error) or tries > _COARSER:
+                raise
+            spacing *= 1.2

@@ -33,38 +33,38 @@ def releases(
         until: when the particles at the last plane are let go, s.
     """
     first, last = planes
-    found = []
-    for far in (first, 2 * last - first):
-        one = _one_side(x, domain, axis, (far, last), layers, until)
-        # What lies on the last plane belongs to one side.
-        if one is not None:
-            found.append(one)
-    return found
+    # What lies on the last plane belongs to the first side.
+    margin = _ROUNDING * (first - last)
+    sides = (
+        _one_side(x, domain, axis, (first + margin, last - margin), planes, layers, until),
+        _one_side(x, domain, axis, (2 * last - first, last - 2 * margin), planes, layers, until),
+    )
+    return [side for side in sides if side is not None]
 
 
 def _one_side(
     x: np.ndarray,
     domain: float,
     axis: int,
+    slab: tuple[float, float],
     planes: tuple[float, float],
     layers: int,
     until: float,
 ) -> dict[str, Any] | None:
-    far, last = planes
-    margin = _ROUNDING * abs(far - last)
-    outer = far + math.copysign(margin, far - last)
+    """The release of the particles in a slab, the outermost first."""
+    first, last = planes
     lower, upper = [0.0] * 3, [domain] * 3
-    lower[axis], upper[axis] = min(outer, last), max(outer, last)
+    lower[axis], upper[axis] = min(slab), max(slab)
     there = np.all((x >= lower) & (x <= upper), axis=1)
     if not there.any():
         return None
-    s = 1 - np.abs(x[there, axis] - last) / abs(far - last)
+    s = 1 - np.abs(x[there, axis] - last) / abs(first - last)
     k = np.clip(np.ceil(layers * s - _ROUNDING), 1, layers)
     early, late = until * float(k.min()) / layers, until * float(k.max()) / layers
     region = {"region": {"lower": lower, "upper": upper}}
     if early == late:
         return {"type": "hold", "end": late} | region
     direction = [0.0] * 3
-    direction[axis] = math.copysign(1.0, last - far)
+    direction[axis] = math.copysign(1.0, slab[1] - slab[0])
     times = {"start": early, "end": late, "layers": round(float(k.max() - k.min())) + 1}
     return {"type": "release", "direction": direction} | times | region
