@@ -161,7 +161,7 @@ def _stone(p: Places, light: np.ndarray, dark: np.ndarray, joint: np.ndarray) ->
     return mixed(p.depth / 0.03 - 0.5, color, _RUBBLE * (0.85 + 0.3 * p.noise[:, None]))
 
 
-def _near_multiple(value: np.ndarray, step: float, width: float) -> np.ndarray:
+def _near_multiple(value: np.ndarray, step: float, width: Any) -> np.ndarray:
     """Whether values are within half a width of a multiple of a step."""
     return np.abs((value + step / 2) % step - step / 2) < width / 2
 
@@ -178,7 +178,7 @@ def _arch_paint(p: Places) -> np.ndarray:
     """Large blocks below, wedge-shaped ones in the curve."""
     x, z = p.x[:, 0] - _ARCH_X, p.x[:, 2] - _SPRING
     around = np.arctan2(z, x) / np.pi * _VOUSSOIRS
-    wedge = _near_multiple(around, 1, 0.2 * 0.2 / np.maximum(np.hypot(x, z), 0.1))
+    wedge = _near_multiple(around, 1, 0.04 / np.maximum(np.hypot(x, z), 0.1))
     joint = np.where(z > 0.02, wedge, _near_multiple(p.x[:, 2], _SPRING / 4, 0.018))
     return _stone(p, _STONE * 1.05, _DARK_STONE, 0.75 * joint)
 

@@ -61,6 +61,7 @@ _VASE = [
 _PORCELAIN, _COBALT, _GOLD = (0.58, 0.60, 0.62), (0.07, 0.14, 0.45), (0.55, 0.40, 0.12)
 _STEM, _LEAF, _LEAF_RIB = (0.16, 0.36, 0.10), (0.12, 0.34, 0.12), (0.30, 0.50, 0.20)
 _STEM_RADIUS = 0.0185
+_GERBERA, _PETALS = 0.098, 11  # its radius, m, and how many petals it has
 # Each flower: where its blossom is, whether a gerbera (or a tulip), and its colour.
 _FLOWERS = [
     ((0.02, 0.03, 0.90), False, (0.60, 0.10, 0.12)),
@@ -88,7 +89,8 @@ def vasedeck(seed: int = 0, detail: float = 1.0) -> Gaussians:
     boards = Solid(box((0, 0, -0.025), (0.62, 0.47, 0.025), 0.008), _deck_paint, gloss=0.06)
     # The vase stays where it is, and so may its shadow.
     foot = Solid(turned_profile(_VASE), plain((0.5, 0.5, 0.5)))
-    deck = filled([boards, foot], (-0.7, -0.5, -0.06), (0.7, 0.5, 0.45), _DECK_SPACING / detail)
+    lower, upper = (-0.7, -0.5, -0.06), (0.7, 0.5, 0.45)
+    deck = filled([boards, foot], lower, upper, _DECK_SPACING / detail, seed)
     return concatenate([bouquet, deck[np.asarray(deck.means)[:, 2] < 0]])
 
 
@@ -106,22 +108,22 @@ def _flower(place: np.ndarray, open_wide: bool, color: Any, index: int) -> list[
     return [_posed(*head, place, direction, 0.05), *leaves, Solid(tube, plain(_STEM))]
 
 
-def _gerbera(color: Any, radius: float = 0.098, petals: int = 11) -> tuple[Distance, Paint]:
+def _gerbera(color: Any) -> tuple[Distance, Paint]:
     """A shallow cup of petals about a dark, domed middle."""
     middle = ellipsoid((0, 0, 0.022), (0.034, 0.034, 0.022))
 
     def cut(x: np.ndarray) -> np.ndarray:
-        return np.abs(np.cos(petals / 2 * np.arctan2(x[:, 1], x[:, 0])))
+        return np.abs(np.cos(_PETALS / 2 * np.arctan2(x[:, 1], x[:, 0])))
 
     def shape(x: np.ndarray) -> np.ndarray:
         r = np.hypot(x[:, 0], x[:, 1])
-        rim = r - radius * (0.78 + 0.22 * np.sqrt(cut(x)))
+        rim = r - _GERBERA * (0.78 + 0.22 * np.sqrt(cut(x)))
         sheet = np.abs(x[:, 2] - 2.5 * r**2) - 0.0175
         return np.minimum(0.8 * np.maximum(rim, sheet), middle(x))
 
     def paint(p: Places) -> np.ndarray:
-        r = np.hypot(p.x[:, 0], p.x[:, 1]) / radius
-        petal = mixed(0.9 - cut(p.x), np.asarray(color) * 1.0, np.asarray(color) * 0.55)
+        r = np.hypot(p.x[:, 0], p.x[:, 1]) / _GERBERA
+        petal = mixed(0.9 - cut(p.x), color, np.asarray(color) * 0.55)
         petal = mixed(1.2 - 2 * r, petal, np.asarray(color) * 0.6 + [0.1, 0.08, 0])
         dotted = mixed(p.noise, (0.16, 0.10, 0.03), (0.50, 0.36, 0.06))
         flower = np.where((middle(p.x) < 0.008)[:, None], dotted, petal)
