@@ -27,6 +27,7 @@ _NODES, _SHELL = 40, 0.6
 _FURTHER = 0.5
 _TIMES, _ARROWS, _ARROW = 24, 8, 0.3
 _MATERIALS = ("tab:orange", "tab:blue", "tab:green", "tab:purple", "tab:pink", "tab:cyan")
+_SHAPES = {"HalfSpace": "half-space", "SampledSDF": "sampled surface"}
 _WALLS = ("saddlebrown", "teal", "slateblue", "olive", "dimgray")
 
 
@@ -144,12 +145,12 @@ def _collider(plan: Plan, wall: Collider, name: str, colour: str) -> Iterator[Ma
     shape, inside = wall.shape, ""
     if isinstance(shape, Complement):
         shape, inside = shape.shape, "inside of a "
-    kind = type(shape).__name__
+    kind = _SHAPES.get(type(shape).__name__, type(shape).__name__.lower())
     start = max(float(wall.start), 0.0)
     points = _shell(plan, wall, start)
     when = f", from {start:.3g} s" if start > 0 else ""
     when += "" if len(points) else ", not in the grid"
-    label = f"{name}{inside}{kind.lower()}, {type(wall.contact).__name__.lower()}{when}"
+    label = f"{name}{inside}{kind}, {type(wall.contact).__name__.lower()}{when}"
     yield Mark(label, "points", points, colour, size=1.5, alpha=0.35)
     if wall.motion is not None and len(points):
         path = _path(wall.motion.at, points.mean(axis=0), start, min(float(wall.end), _end(plan)))
