@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from pgjax.cli import main
 from pgjax.render import Gaussians, load_capture, load_ply, save_ply
 from pgjax.scenes import plan, read_scene
+from pgjax.scenes.choices import chosen
 from pgjax.scenes.draft import draft
 from pgjax.scenes.draft_text import ground_in_words, up_in_words
 from pgjax.scenes.inspect import inspect
@@ -104,6 +105,15 @@ def test_level_captures_have_boxes_and_tilted_ones_cylinders():
 def test_what_hovers_has_its_height_over_the_ground():
     found = inspect(capture(hover=0.25)[0])
     assert found.clearance == pytest.approx(0.25, abs=0.02)
+
+
+def test_what_stands_on_the_ground_has_its_floor_where_it_was_cut_off():
+    for hover in (0, 0.25):
+        gaussians, _ = capture(hover=hover)
+        choices, moving = chosen(inspect(gaussians), gaussians)
+        assert choices.hover == pytest.approx(hover / (2 * RADIUS), abs=0.04)
+        assert choices.floor == (0 if hover else choices.hover)
+        assert float(moving.means[:, 2].min()) == pytest.approx(0, abs=1e-5)
 
 
 def test_without_a_ground_the_usual_direction_is_guessed_and_said_to_be():

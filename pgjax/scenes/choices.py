@@ -19,6 +19,8 @@ _PER_CELL, _FINEST, _COARSEST = 8, 1 / 48, 1 / 16
 _BESIDE, _OVER, _HIGHEST = 0.5, 0.3, 3.0
 # Needles are worth splitting if there is this part of them, and if that leaves so few particles.
 _MANY_NEEDLES, _MOST_PARTICLES = 0.02, 200_000
+# What begins below so many layers of the ground stands on it.
+_STANDING = 1.5
 # Variance along over that across, above which an object has a broad side.
 _BROAD = 1.7
 
@@ -29,6 +31,7 @@ class Choices(NamedTuple):
     Attributes:
         size: longest side of the object.
         hover: height of its foot above the ground.
+        floor: height of the floor above the ground: under the foot if that was cut off the ground.
         half: half of its extents in x and y, and its height, `(3,)`.
         reach: the corners of what its particles take, long Gaussians split, over its foot `(2, 3)`.
         spacing: of the grid.
@@ -41,6 +44,7 @@ class Choices(NamedTuple):
 
     size: float
     hover: float
+    floor: float
     half: np.ndarray
     reach: np.ndarray
     spacing: float
@@ -76,9 +80,12 @@ def chosen(findings: Findings, gaussians: Gaussians) -> tuple[Choices, Gaussians
     foot = np.array([*(lower + upper)[:2] / 2, lower[2]])
     moving = gaussians[findings.moves].transformed(Similarity(scale, rotation, -scale * foot))
     half = scale * extent * np.array([0.5, 0.5, 1])
+    hover = _rounded(min(scale * findings.clearance, _HIGHEST * _SIZE))
+    layer = 0.0 if findings.ground is None else findings.ground.layer
     choices = Choices(
         size=_SIZE,
-        hover=_rounded(min(scale * findings.clearance, _HIGHEST * _SIZE)),
+        hover=hover,
+        floor=hover if findings.clearance <= _STANDING * layer else 0.0,
         half=half,
         reach=np.zeros((2, 3)),
         spacing=0.0,

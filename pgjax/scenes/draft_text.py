@@ -161,7 +161,11 @@ def _model(ply: str, findings: Findings, choices: Choices, made: Plan | None) ->
         f"{'' if choices.split else '# '}split_longer_than = {NEEDLE:g}",
     ]
     if not choices.fill:
-        return [*lines, "# No inside to be filled was found.", "# fill = {}"]
+        lines += _comment(
+            "No inside to be filled was found. A surface that is open below, where it was cut off "
+            "the ground, encloses one if holes of its width are closed: `seal`, in m."
+        )
+        return [*lines, "# fill = { seal = 0.3 }"]
     notes = () if made is None else made.notes
     found = [note.removeprefix("filling: ") for note in notes if note.startswith("filling: ")]
     lines += _comment(f"The inside is filled with particles: {', '.join(found)}.")
@@ -207,11 +211,14 @@ def _seconds(seconds: float) -> str:
 
 def _walls(choices: Choices) -> list[str]:
     inner = 2 * choices.spacing
+    where = f"A wall acts about {_AHEAD:g} spacings before its place, hence that much lower."
+    if choices.floor > 0:
+        where = f"The foot was cut off at z = {choices.floor:g}, so the floor is there. {where}"
     return [
-        f"# The ground. A wall acts about {_AHEAD:g} spacings before its place, hence below z = 0.",
+        *_comment(f"The ground. {where}"),
         "[[boundary]]",
         'type = "half-space"',
-        f"point = [0, 0, {-_AHEAD * choices.spacing:.3g}]",
+        f"point = [0, 0, {choices.floor - _AHEAD * choices.spacing:.3g}]",
         "normal = [0, 0, 1]",
         'contact = "separating"',
         "friction = 0.5",

@@ -151,7 +151,7 @@ def _collider(plan: Plan, wall: Collider, name: str, colour: str) -> Iterator[Ma
     when = f", from {start:.3g} s" if start > 0 else ""
     when += "" if len(points) else ", not in the grid"
     label = f"{name}{inside}{kind}, {type(wall.contact).__name__.lower()}{when}"
-    yield Mark(label, "points", points, colour, size=1.5, alpha=0.35)
+    yield Mark(label, "points", points, colour, size=3.0, alpha=0.5)
     if wall.motion is not None and len(points):
         path = _path(wall.motion.at, points.mean(axis=0), start, min(float(wall.end), _end(plan)))
         yield Mark("way of what moves", "lines", path, "magenta", size=1.5)
