@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pgjax.boundary import Box, Collider, ParticleImpulse, ParticleMotion, Separating, Sticky
+from pgjax.boundary.particles import Particles
 from pgjax.cli import main
 from pgjax.render import Gaussians, save_ply
 from pgjax.scenes import SceneError, plan
@@ -387,6 +388,22 @@ def test_twists_turn_against_the_normal(public):
     assert "-1.9 rad/s" in note(made, "enforce_particle_velocity_rotation")
 
 
+def test_a_particle_on_the_axis_turns(tmp_path, model):
+    made = converted(tmp_path, model, boundary_conditions=[twist(1, 0, 1, point=(1, 1, 1))])
+    planned = plan(made.scene())
+    (led,) = planned.scene.particle_conditions
+    n = len(planned.moving)
+    first = np.flatnonzero(led.mask)[:2]
+    x = np.array(planned.state.x) + np.asarray(planned.state.origin)
+    x[first] = [[1, 1.1, 1], [1.05, 1, 1]]
+    zero = jnp.zeros((n, 3))
+    before = Particles(jnp.asarray(x), zero, jnp.zeros((n, 3, 3)), jnp.ones(n), jnp.zeros(n, bool))
+    after = led(before, jnp.asarray(0.0), jnp.asarray(1e-6))
+    assert jnp.isfinite(after.v).all()
+    # About −y with 1 rad/s.
+    np.testing.assert_allclose(after.v[first], [[0, 0, 0], [0, 0, 0.05]], atol=1e-5)
+
+
 def released(x, layers, *, first=1.5, last=0.5, until=1.5):
     """When the boxes of the reference let particles go, s."""
     held = np.zeros(len(x))
@@ -563,7 +580,7 @@ def test_a_bounding_box_has_times(tmp_path, model):
     made = converted(tmp_path, model, boundary_conditions=[wall])
     assert [w["type"] for w in made.table["boundary"]] == 6 * ["half-space"]
     assert {w["end"] for w in made.table["boundary"]} == {1}
-    assert made.table["boundary"][1]["point"] == [pytest.approx(47 * 0.04), 1, 1]
+    assert made.table["boundary"][1]["point"] == [pytest.approx(46.75 * 0.04), 1, 1]
     assert made.table["boundary"][1]["normal"] == [-1, 0, 0]
     kept = converted(tmp_path, model, boundary_conditions=[wall], legacy=True)
     assert kept.table["boundary"][0]["type"] == "box"
@@ -695,6 +712,21 @@ def test_ficus_runs(tmp_path, model, capsys, monkeypatch):
     assert (tmp_path / "out/a/video.mp4").stat().st_size > 0
     record = json.loads((tmp_path / "out/a/run.json").read_text())
     assert record
+
+
+def test_an_interrupted_run_says_how_to_go_on(tmp_path, model, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = written(tmp_path)
+    monkeypatch.setattr("pgjax.scenes.run", _interrupted)
+    monkeypatch.setattr("pgjax.scenes.record.unfinished", lambda folder: folder)
+    options = ["--physgaussian", str(config), "--model", str(model), "--legacy"]
+    assert main(["run", *options]) == 130
+    go_on = f"go on with: pgjax run {' '.join(options)} --out out/ficus --resume"
+    assert go_on in capsys.readouterr().err
+
+
+def _interrupted(*_, **__):
+    raise KeyboardInterrupt
 
 
 def test_convert_writes_a_scene_file(tmp_path, model, capsys, monkeypatch):

@@ -6,6 +6,7 @@ to `scale` and its middle at (1, 1, 1).
 
 import dataclasses
 import math
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ from pgjax.timestep import ELASTIC_FRACTION, substeps_for
 
 # So many times the rate at which one step would leave 1/e: nothing is left after a step.
 _AT_ONCE = 100.0
+# An array of numbers on several lines.
+_SPREAD = re.compile(r"\[\n(?: +[^\[\]{}\n]+,\n)+\]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +57,8 @@ class Converted:
     def text(self) -> str:
         """The scene file, its notes in front."""
         head = "".join(f"# {note}\n" for note in self.notes)
-        return f"{head}\n{tomli_w.dumps(self.table)}"
+        table = _SPREAD.sub(_on_one_line, tomli_w.dumps(self.table))
+        return f"{head}\n{table}"
 
     def write(self, path: Path) -> None:
         """Write the scene file, and the labels beside it."""
@@ -117,8 +121,21 @@ def convert(config: Path, model: Path, *, legacy: bool = False) -> Converted:
         *conditions.notes,
         *seen.notes,
     ]
-    plain = {key: value for key, value in table.items() if value}
+    plain = {key: _rounded(value) for key, value in table.items() if value}
     return Converted(read.name, plain, placed.labels, tuple(notes))
+
+
+def _rounded(value: Any) -> Any:
+    """The same without the last digits of numbers, which are rounding."""
+    if isinstance(value, dict):
+        return {key: _rounded(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return float(f"{value:.12g}") if isinstance(value, float) else value
+
+
+def _on_one_line(array: re.Match[str]) -> str:
+    return f"[{', '.join(line.strip(' ,') for line in array[0].splitlines()[1:-1])}]"
 
 
 def _model_notes(config: Config, walls: list[dict[str, Any]]) -> list[str]:

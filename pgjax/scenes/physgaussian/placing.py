@@ -153,7 +153,7 @@ def _filled(config: Config, placed: Placed) -> Placed:
     x, spacing = _fitting(config, placed, table, max(wanted, _FINEST_FILL * grid))
     notes = [
         f"particle_filling: particles {spacing:.4g} m apart in every closed body, from seed 0; "
-        f"more than {filling.max_particles} are an error, broken covariances count as points"
+        f"at most {filling.max_particles}; broken covariances count as points"
     ]
     if spacing > wanted:
         notes.append(

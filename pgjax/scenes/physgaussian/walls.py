@@ -25,9 +25,9 @@ def bounding_box(t: Table) -> Make:
     times = times_of(t)
 
     def make(here: Setting) -> Pieces:
-        """Walls on the last of the three outer nodes on each side."""
+        """Walls behind which the three outer nodes on each side are, whatever the rounding."""
         dx = here.domain / here.n_grid
-        low, high = 2 * dx, (here.n_grid - 3) * dx
+        low, high = 2.25 * dx, (here.n_grid - 3.25) * dx
         always = times.start <= 0 and times.end >= here.duration
         if here.legacy or always:
             notes = ["acts always, its times are ignored"] if timed and not always else []
