@@ -536,6 +536,16 @@ def test_a_time_step_that_is_too_long_becomes_a_part_of_the_frame(tmp_path, mode
     assert "0.79 of the largest" in note(soft, "frame_dt")
 
 
+def test_a_time_step_above_the_bound_is_kept_in_legacy_only(tmp_path, model):
+    fixed, kept = (plan(converted(tmp_path, model, legacy=on).scene()) for on in (False, True))
+    assert float(fixed.scene.rest_limit()) < 1e-4
+    assert fixed.dt <= 0.5 * float(fixed.scene.rest_limit()) * (1 + 1e-6)
+    assert not fixed.allow_unstable
+    assert kept.dt == pytest.approx(1e-4, rel=1e-6)
+    assert kept.substeps == 400
+    assert kept.allow_unstable
+
+
 def test_truncated_frames(tmp_path, model):
     assert "2000 steps" in note(converted(tmp_path, model, "wolf", "particle_filling"), "frame_dt")
     made = converted(tmp_path, model, "wolf", "particle_filling", legacy=True)

@@ -41,6 +41,7 @@ class Plan:
         frames: to run.
         fps: frames per second.
         view: the camera's part of the scene file.
+        allow_unstable: whether the time step may be above the stable one.
         notes: what was found in the models and done to them, a line each.
         models: of the scene file.
         body: of which model each particle is, `(n,)`.
@@ -57,6 +58,7 @@ class Plan:
     frames: int
     fps: float
     view: CameraPart
+    allow_unstable: bool = False
     notes: tuple[str, ...] = ()
     models: tuple[ModelPart, ...] = ()
     body: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
@@ -108,6 +110,7 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         frames=file.time.frames if frames is None else frames,
         fps=file.time.fps,
         view=file.camera,
+        allow_unstable=file.time.allow_unstable,
         notes=tuple(note for b in bodies for note in b.notes),
         models=file.models,
         body=crowd.body,
@@ -134,7 +137,7 @@ def _longest_step(file: SceneFile, scene: Scene, state: State) -> float:
         return stable_dt(scene, state, fraction=file.time.fraction)
     limit = float(scene.rest_limit())
     # The limit may be known to single precision only.
-    if file.time.dt > limit * (1 + 1e-6):
+    if file.time.dt > limit * (1 + 1e-6) and not file.time.allow_unstable:
         raise SceneError(
             f"{file.source} [time]: `dt` must be at most {limit:.4g} s, the largest stable time "
             f"step at rest, but is {file.time.dt:g}."

@@ -245,6 +245,7 @@ def _advance(plan: Plan, state: State) -> Trajectory:
             substeps=plan.substeps,
             save=_nothing,
             throw=False,
+            allow_unstable=plan.allow_unstable,
         )
 
 

@@ -40,6 +40,7 @@ class TimePart:
     fps: float
     dt: float | None
     fraction: float
+    allow_unstable: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,4 +194,5 @@ def _time(t: Table) -> TimePart:
         fps=t.number("fps", 25.0, above=0),
         dt=t.number("dt", None, above=0),
         fraction=t.number("fraction", 0.5, above=0, below=1),
+        allow_unstable=t.boolean("allow_unstable", False),
     )

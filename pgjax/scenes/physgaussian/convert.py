@@ -223,8 +223,15 @@ def _time(
     dt, frame = config.substep_dt, config.frame_dt
     limit = _largest_step(config, tables, forces)
     truncated = max(int(frame / dt), 1)
-    steps, notes = substeps_for(frame, dt), []
-    if dt > limit * (1 + 1e-6):
+    steps, notes, override = substeps_for(frame, dt), [], {}
+    if dt > limit * (1 + 1e-6) and legacy:
+        steps, frame = truncated, truncated * dt
+        override = {"allow_unstable": True}
+        notes.append(
+            f"substep_dt: {dt:g} s is kept, above the largest stable one, {limit:.4g} s: "
+            f"`allow_unstable`; {steps} steps a frame of {frame:g} s"
+        )
+    elif dt > limit * (1 + 1e-6):
         steps = substeps_for(frame, ELASTIC_FRACTION * limit)
         notes.append(
             f"substep_dt: {dt:g} s is above the largest stable one, {limit:.4g} s: {steps} steps "
@@ -242,7 +249,7 @@ def _time(
             f"largest stable ones at rest"
         )
     notes.append(f"frame_num: {config.frame_num} frames after a first one of the state of rest")
-    return {"frames": config.frame_num, "fps": 1 / frame, "dt": dt}, notes
+    return {"frames": config.frame_num, "fps": 1 / frame, "dt": dt, **override}, notes
 
 
 def _largest_step(config: Config, tables: list[dict[str, Any]], forces: dict[str, Any]) -> float:
