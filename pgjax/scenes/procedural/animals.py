@@ -24,6 +24,8 @@ from pgjax.scenes.procedural.solids import (
 
 _WOLF_SPACING = 0.0145
 _GROUND_SPACING = 0.022
+# Height of the ground, m: a little below the paws, so that no Gaussian of the two is level.
+_GROUND_TOP = -0.005
 _FOX_SPACING = 0.017
 
 _GREY = np.array([0.38, 0.34, 0.295])
@@ -98,13 +100,14 @@ def _ramp(x: np.ndarray, start: float, end: float) -> np.ndarray:
 
 
 def _ground(color: np.ndarray, radius: float, spacing: float, seed: int) -> Gaussians:
-    """A disk whose upper side is the plane z = 0; what stands on it casts no shadow."""
+    """A flat disk; what stands on it casts no shadow."""
 
     def paint(p: Places) -> np.ndarray:
         tone = 0.8 + 0.2 * clouds(p.x, 0.12, seed) + 0.2 * p.noise
         return color * tone[:, None]
 
-    disk = cylinder((0, 0, -2.5 * spacing), (0, 0, 0), radius, 0.5 * spacing)
+    top = np.array([0, 0, _GROUND_TOP])
+    disk = cylinder(top - [0, 0, 2.5 * spacing], top, radius, 0.5 * spacing)
     upper = np.array([radius + spacing, radius + spacing, spacing])
     return filled([Solid(disk, paint)], -np.array([1, 1, 4]) * upper, upper, spacing, seed)
 

@@ -26,16 +26,15 @@ from pgjax.scenes.procedural.solids import (
 )
 
 _CAN_SPACING = 0.02
-_CAN_WALL = 0.047
+_CAN_RADIUS, _CAN_WALL = 0.26, 0.047
 # Radius and height, m, from the foot of a can along its outside to the middle of its lid.
 _CAN_PROFILE = (
-    (0, 0.03), (0.15, 0.03), (0.18, 0), (0.215, 0), (0.26, 0.065),
-    (0.26, 0.86), (0.215, 0.955), (0.215, 1.0), (0.185, 1.0), (0.17, 0.97), (0, 0.97),
+    (0, 0.03), (0.15, 0.03), (0.18, 0), (0.215, 0), (_CAN_RADIUS, 0.065),
+    (_CAN_RADIUS, 0.86), (0.215, 0.955), (0.215, 1.0), (0.185, 1.0), (0.17, 0.97), (0, 0.97),
 )  # fmt: skip
 _PLANE_SPACING = 0.0125
 # Height of the axis of the fuselage, m.
 _AXIS = 0.22
-
 
 _ALUMINIUM = np.array([0.50, 0.51, 0.53])
 _CAN_RED = np.array([0.50, 0.03, 0.05])
@@ -61,11 +60,8 @@ def can(seed: int = 0, detail: float = 1.0) -> Gaussians:
     """
     spacing = _CAN_SPACING / detail
     shell = hollow(turned_profile(_CAN_PROFILE), _CAN_WALL)
-    tab = placed(ellipsoid((0, 0, 0), (0.075, 0.042, 0.024)), (0.03, 0, 0.985))
-    solids = [
-        Solid(tab, plain(_ALUMINIUM), gloss=0.3),
-        Solid(shell, _label, gloss=0.3),
-    ]
+    tab = ellipsoid((0.03, 0, 0.985), (0.075, 0.042, 0.024))
+    solids = [Solid(tab, plain(_ALUMINIUM), gloss=0.3), Solid(shell, _label, gloss=0.3)]
     body = filled(solids, (-0.3, -0.3, 0), (0.3, 0.3, 1.04), spacing, seed)
     return concatenate([body, _press(spacing, seed), _table(spacing, seed)])
 
@@ -76,28 +72,23 @@ def _label(p: Places) -> np.ndarray:
     angle = np.arctan2(y, x)
     wave = np.abs(z - 0.42 - 0.09 * np.sin(2 * angle + 1)) < 0.055
     thread = np.abs(z - 0.315 - 0.09 * np.sin(2 * angle + 1)) < 0.016
-    # The badge is seen from the side of the sun and from the opposite one.
-    across = 0.26 * np.abs(np.mod(angle + 1.05 + np.pi / 2, np.pi) - np.pi / 2)
+    # One badge in front, and one behind.
+    across = _CAN_RADIUS * np.abs(np.mod(angle + 1.05 + np.pi / 2, np.pi) - np.pi / 2)
     badge = np.hypot(across, z - 0.68) < 0.11
     core = np.hypot(across, z - 0.68) < 0.07
     white = (wave | thread | badge) & ~core
     label = mixed(white * 1.0, _CAN_RED, _WHITE)
     label = np.where(core[:, None], _YELLOW, label)
-    outside = (z > 0.085) & (z < 0.85) & (p.normal[:, :2] * p.x[:, :2] > 0).any(axis=1)
-    outside &= np.hypot(x, y) > 0.26 - 0.6 * _CAN_WALL
-    return np.where(outside[:, None], label, _ALUMINIUM) * (0.95 + 0.1 * p.noise)[:, None]
+    printed = (z > 0.085) & (z < 0.85) & (np.hypot(x, y) > _CAN_RADIUS - 0.6 * _CAN_WALL)
+    return np.where(printed[:, None], label, _ALUMINIUM) * (0.95 + 0.1 * p.noise)[:, None]
 
 
 def _press(spacing: float, seed: int) -> Gaussians:
     """A round plate of steel on a rod."""
     plate = cylinder((0, 0, 1.05), (0, 0, 1.1), 0.37, 0.01)
     rod = cylinder((0, 0, 1.08), (0, 0, 1.3), 0.06, 0.01)
-
-    def paint(p: Places) -> np.ndarray:
-        return _STEEL * (0.9 + 0.2 * p.noise)[:, None]
-
-    solids = [Solid(union(plate, rod), paint, gloss=0.2)]
-    return filled(solids, (-0.4, -0.4, 1.0), (0.4, 0.4, 1.32), spacing, seed)
+    steel = Solid(union(plate, rod), plain(_STEEL, 0.1), gloss=0.2)
+    return filled([steel], (-0.4, -0.4, 1.0), (0.4, 0.4, 1.32), spacing, seed)
 
 
 def _table(spacing: float, seed: int) -> Gaussians:
