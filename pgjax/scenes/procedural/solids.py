@@ -60,7 +60,7 @@ def filled(
     The solids are lattices of the spacing, whose outermost layer lies on the surface as flat disks.
     All are one body: what touches sticks together, and no surface is between them. Light is baked
     in: sky as far as nothing is near, sun where nothing is in its way; what is inside is lit
-    evenly, for the day it is torn open.
+    evenly.
 
     Args:
         solids: what is filled.
@@ -84,7 +84,9 @@ def filled(
         mine = np.flatnonzero(own == index)
         here = Places(*(part[mine] for part in places))
         albedo = np.broadcast_to(solid.paint(here), here.x.shape)
-        body = disks_and_balls(here.x, here.normal, surface[mine], spacing, albedo)
+        # What is inside faces the sun, for the day it is torn open.
+        facing = np.where(surface[mine, None], here.normal, LIGHT)
+        body = disks_and_balls(here.x, facing, surface[mine], spacing, albedo)
         bodies.append(body._replace(gloss=np.full(len(mine), solid.gloss)))
         order.append(mine)
     body, inside = Body(*join(bodies)), ~surface[np.concatenate(order)]
