@@ -7,6 +7,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import jax
 import numpy as np
+from PIL import Image
 
 from benchmarks.speed.report import cpu
 from pgjax.scenes import Plan, presets, resolve
@@ -14,6 +15,7 @@ from pgjax.scenes import Plan, presets, resolve
 COMMAND = "python -m benchmarks.scenes"
 _MOMENTS = (0, 1 / 3, 1)
 _LIMIT = 120.0
+_THUMB, _IN_A_ROW = 160, 7
 
 
 def stored(path: Path) -> list[dict]:
@@ -84,6 +86,29 @@ def write_strip(path: Path, video: Path) -> None:
     iio.imwrite(path, strip[::2, ::2] if strip.shape[0] > 480 else strip)
 
 
+def write_sheet(path: Path, strips: list[Path]) -> None:
+    """The middle picture of each strip, all of one height, in rows."""
+    thumbs = []
+    for strip in strips:
+        image = Image.open(strip)
+        width = image.width // 3
+        middle = image.crop((width, 0, 2 * width, image.height))
+        wide = round(width * _THUMB / image.height)
+        thumbs.append(np.asarray(middle.resize((wide, _THUMB)))[:, _centred(wide)])
+    rows = [thumbs[i : i + _IN_A_ROW] for i in range(0, len(thumbs), _IN_A_ROW)]
+    sheet = np.full((len(rows) * _THUMB, _IN_A_ROW * _THUMB, 3), 255, np.uint8)
+    for i, row in enumerate(rows):
+        for j, thumb in enumerate(row):
+            sheet[i * _THUMB : (i + 1) * _THUMB, j * _THUMB : (j + 1) * _THUMB] = thumb
+    iio.imwrite(path, sheet)
+
+
+def _centred(wide: int) -> slice:
+    """The columns in the middle of a picture that is at least as wide as high."""
+    first = (wide - _THUMB) // 2
+    return slice(first, first + _THUMB)
+
+
 def write_gallery(docs: Path, rows: list[dict]) -> None:
     """The page with a picture of each scene."""
     lines = [
@@ -99,6 +124,8 @@ def write_gallery(docs: Path, rows: list[dict]) -> None:
         lines += ["", f"## {row['scene']}", "", *_about(row["scene"]), ""]
         lines += [f"![{row['scene']}](images/gallery/{row['scene']}.png)"]
     (docs / "gallery.md").write_text("\n".join(lines) + "\n")
+    pictures = docs / "images" / "gallery"
+    write_sheet(pictures / "all.png", [pictures / f"{row['scene']}.png" for row in rows])
 
 
 def _about(name: str) -> list[str]:
