@@ -238,7 +238,7 @@ def _grille_paint(p: Places) -> np.ndarray:
 # Balls that show a material ----------------------------------------------------------------------
 
 _BALL_SPACING, _FLOOR_SPACING = 0.0145, 0.022
-_BALL_RADIUS, _BALL_DISTANCE, _DROP, _TILE = 0.128, 0.37, 0.22, 0.12
+_BALL_RADIUS, _BALL_DISTANCE, _DROP, _TILE = 0.132, 0.37, 0.25, 0.12
 _BALL_COLORS = [((0.60, 0.13, 0.20), 0.10), ((0.12, 0.42, 0.22), 0.2), ((0.16, 0.30, 0.55), 0.4)]
 
 _CORE, _STAND = (0.60, 0.58, 0.52), (0.22, 0.22, 0.24)
@@ -247,7 +247,7 @@ _CORE, _STAND = (0.60, 0.58, 0.52), (0.22, 0.22, 0.24)
 def materials(seed: int = 0, detail: float = 1.0) -> Gaussians:
     """Three balls on stands, cut open about a white core, above a chequered floor.
 
-    They hang side by side along x, with the stands 0.22 m above the floor; that is below z = 0 and
+    They hang side by side along x, with the stands 0.25 m above the floor; that is below z = 0 and
     takes no shadow of what will fall.
 
     Args:
@@ -266,10 +266,9 @@ def materials(seed: int = 0, detail: float = 1.0) -> Gaussians:
 
 def _material_ball(foot: Any, color: Any, gloss: float) -> list[Solid]:
     """A thick shell that is cut open above and in front of a white core, and a stand."""
-    middle = np.asarray(foot) + (0.05 + _BALL_RADIUS) * UP
-    base = turned_profile(
-        [(0, 0), (0.10, 0), (0.104, 0.02), (0.075, 0.05), (0.07, 0.08), (0, 0.08)]
-    )
+    # A little forward, for the weight that is missing there.
+    middle = np.add(foot, (0, -0.005, 0.02 + _BALL_RADIUS))
+    base = turned_profile([(0, 0), (0.125, 0), (0.13, 0.02), (0.115, 0.075), (0, 0.075)])
 
     def cut(x: np.ndarray) -> np.ndarray:
         across, ahead, above = (x - middle).T
