@@ -48,7 +48,7 @@ density = 400
 # E = 2e5
 # nu = 0.4
 # density = 1000
-# plasticity = { type = "herschel-bulkley", yield_stress = 300, viscosity = 20, h = 0.8 }
+# plasticity = { type = "herschel-bulkley", yield_stress = 500, viscosity = 300, h = 0.8 }
 """
 
 
