@@ -14,7 +14,7 @@ from pgjax import cli
 from pgjax.cases import read_case
 from pgjax.render import Gaussians, load_ply, save_ply
 from pgjax.result import SimulationError
-from pgjax.scenes import SceneError, plan, presets, read_scene, resolve
+from pgjax.scenes import SceneError, plan, read_scene, resolve
 from pgjax.scenes.capture import upright
 from pgjax.scenes.run import states
 
@@ -195,13 +195,6 @@ def test_leaving_the_grid_keeps_what_was_computed(folder, capsys):
 
 def test_errors_of_a_rollout_are_runtime_errors():
     assert issubclass(SimulationError, RuntimeError)
-
-
-@pytest.mark.parametrize("name", presets())
-def test_presets_are_complete(name):
-    p = plan(read_scene(resolve(name)))
-    assert p.scene.particle_count > 1000
-    assert 0 < p.dt < 1
 
 
 def test_info(capsys):
