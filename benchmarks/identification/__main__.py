@@ -3,7 +3,7 @@
     python -m benchmarks.identification [--cases NAME …] [--tiers self cross] [--views N] [--jobs N]
 
 prints one table and writes it to `benchmarks/results/identification_cpu.json` and `.md`; rows of
-cases that were not run now are kept. In the tier "self" the data are made with the estimator's
+cases that were not run now are kept, and the remark that stands in the file. In the tier "self" the data are made with the estimator's
 own discretisation, in the tier "cross" with other particles, spacing / 1.5 and half the time step.
 Each case runs in a process of its own, with `--jobs N` on one core each and N at once.
 """
@@ -34,8 +34,9 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     target = options.out / "identification_cpu.json"
-    known = json.loads(target.read_text())["rows"] if target.exists() else []
-    rows = {(row["case"], row["tier"], row["views"]): row for row in known}
+    known = json.loads(target.read_text()) if target.exists() else {"rows": []}
+    remark = known.get("remark", "")
+    rows = {(row["case"], row["tier"], row["views"]): row for row in known["rows"]}
     wanted = [
         (name, tier, options.views if cases[name].views else 0)
         for name in options.cases
@@ -50,7 +51,8 @@ def main() -> int:
             row = done.result()
             rows[row["case"], row["tier"], row["views"]] = row
             print(report.line(row), flush=True)
-            report.write(options.out, sorted(rows.values(), key=lambda row: _place(cases, row)))
+            ordered = sorted(rows.values(), key=lambda row: _place(cases, row))
+            report.write(options.out, ordered, remark)
     return 0
 
 

@@ -25,14 +25,15 @@ def line(row: dict) -> str:
     return f"{head}: {', '.join(parts)}; {row['iterations']} iterations, {row['seconds']:.0f} s"
 
 
-def write(folder: Path, rows: list[dict]) -> None:
-    """Both files."""
+def write(folder: Path, rows: list[dict], remark: str = "") -> None:
+    """Both files; the remark is what a reader of these numbers has to know."""
     folder.mkdir(parents=True, exist_ok=True)
     machine = {
         "cpu": cpu(),
         "date": datetime.date.today().isoformat(),
         "jax": jax.__version__,
         "command": COMMAND,
+        "remark": remark,
     }
     (folder / "identification_cpu.json").write_text(
         json.dumps({**machine, "rows": rows}, indent=1) + "\n"
@@ -57,6 +58,7 @@ def _markdown(machine: dict, rows: list[dict]) -> str:
         "those of rounding, of *cross* of the scatter between frames where that is wider. "
         "Iterations are counted over all stages; a tangent counts as a simulation.",
         "",
+        *([machine["remark"], ""] if machine["remark"] else []),
         "| case | tier | unknown | truth | estimate | error | demanded | met | 95 % interval | "
         "mismatch | verdict |",
         "|---|---|---|---:|---:|---:|---:|---|---|---:|---|",
