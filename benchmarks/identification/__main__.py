@@ -3,9 +3,10 @@
     python -m benchmarks.identification [--cases NAME …] [--tiers self cross] [--views N] [--jobs N]
 
 prints one table and writes it to `benchmarks/results/identification_cpu.json` and `.md`; rows of
-cases that were not run now are kept, and the remark that stands in the file. In the tier "self" the data are made with the estimator's
-own discretisation, in the tier "cross" with other particles, spacing / 1.5 and half the time step.
-Each case runs in a process of its own, with `--jobs N` on one core each and N at once.
+cases that were not run now are kept, and the remark that stands in the file. In the tier "self"
+the data are made with the estimator's own discretisation, in the tier "cross" with other particles,
+spacing / 1.5 and half the time step. Each case runs in a process of its own, with `--jobs N` on one
+core each and N at once.
 """
 
 import argparse
