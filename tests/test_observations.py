@@ -113,6 +113,7 @@ def test_fit_from_pictures(measure):
 
 
 @float64
+@pytest.mark.slow
 def test_fit_from_silhouettes():
     known = parameters(nu=Parameter(0.3, fixed=True), E=Parameter(2e4, fixed=True))
     found = fit(pictured("silhouette", 2, frames=3, unknowns=known), tolerance=1e-4)
