@@ -94,7 +94,7 @@ def measure(request):
         request.node.user_properties.append(("measured", row))
         assert ok, f"{case}, {quantity}: {value:.4g}, demanded {demand}"
 
-    def curve(case, panel, series, x, y, *, order=None):
+    def curve(case, panel, series, x, y, *, order=None, over="h/L"):
         kept = {
             "case": case,
             "panel": panel,
@@ -102,6 +102,7 @@ def measure(request):
             "x": [float(value) for value in x],
             "y": [float(value) for value in y],
             "order": order,
+            "over": over,
         }
         request.node.user_properties.append(("curve", kept))
 

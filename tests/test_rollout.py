@@ -288,7 +288,9 @@ def test_materials_far_apart_do_not_meet(measure, holds):
             (alone.x, alone.v, alone.C, alone.Fe),
         )
         law = type(material.elasticity).__name__
-        measure("H43", f"{law} beside another material = alone, 30 steps", gap, below=1e-13)
+        # Alone and together the sums at a node are in another order.
+        bound = 1e-13 if alone.x.dtype == jnp.float64 else 1e-5
+        measure("H43", f"{law} beside another material = alone, 30 steps", gap, below=bound)
         holds("H43", material=law)
 
 

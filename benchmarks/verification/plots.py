@@ -36,6 +36,6 @@ def _panel(axis: Any, title: str, curves: list[dict]) -> None:
         top = max(max(c["y"]) for c in expected)
         axis.loglog(x, top * (x / x[1]) ** order, "k:", lw=1, label=f"order {order:g}")
     axis.set_title(title, fontsize=10)
-    axis.set_xlabel("h/L")
+    axis.set_xlabel(curves[0]["over"])
     axis.grid(alpha=0.3, which="both")
     axis.legend(fontsize=7)

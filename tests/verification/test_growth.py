@@ -161,7 +161,9 @@ def test_g7_exponential_growth_is_reported(measure):
     t = problem.frame_dt * problem.frames
     continuous = np.sinh(rate * t) / (rate * t)
     measure("G7", "the same over sinh(kt)/(kt)", report.largest / continuous, within=(0.5, 1.5))
-    measure.curve("G7", "growth of |∂x/∂v₀| over t", "unstable balance", report.t, report.values)
+    measure.curve(
+        "G7", "growth of |∂x/∂v₀|", "unstable balance", report.t, report.values, over="t, s"
+    )
     first = 1 + int(np.argmax(exact > LARGEST_GROWTH))
     assert [f"at frame {first} " in m for m in report.messages] == [True]
     assert "chaotic" in str(report)
@@ -210,7 +212,7 @@ def test_g7_growth_of_impacts(measure, what):
     unknowns = {"E": Parameter(4 * E, upper=4 * E, log=True)}
     blank = Positions(np.zeros((12, 64, 2)))
     report = growth(Problem(unknowns, build, blank, frame_dt=0.05))
-    measure.curve("G7", "growth of |∂x/∂v₀| over t", what, report.t, report.values)
+    measure.curve("G7", "growth of |∂x/∂v₀|", what, report.t, report.values, over="t, s")
     # Free flight first, exactly; the floor takes the motion, or magnifies what differs in it.
     measure("G7", f"growth after 0.05 s, {what}", report.values[0], within=(0.99, 1.01))
     measure("G7", f"growth after 0.6 s, {what}", report.values[-1], within=(0.1, 10.0))
