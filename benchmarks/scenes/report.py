@@ -28,7 +28,7 @@ def law(plan: Plan) -> str:
     names = []
     for material in plan.scene.materials:
         flow = material.plasticity
-        names.append(type(material.law).__name__ + (f", {type(flow).__name__}" if flow else ""))
+        names.append(type(material.elasticity).__name__ + (f", {type(flow).__name__}" if flow else ""))
     return "; ".join(dict.fromkeys(names))
 
 
