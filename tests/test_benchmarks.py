@@ -1,12 +1,15 @@
 """The benchmarks run; how fast anything is, no test says."""
 
 import importlib.util
+import json
 import math
 import pathlib
 import subprocess
 import sys
 
 import pytest
+
+from pgjax.scenes import presets
 
 ROOT = pathlib.Path(__file__).parent.parent
 SPEED = ("speed", "--quick", "--without-peers", "--materials", "neo-Hookean")
@@ -86,3 +89,24 @@ def test_captures_that_are_not_there_are_named(tmp_path):
     run = run_benchmark("render", *options, "--without-peers")
     assert "guitar is left out" in run.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_every_scene_is_checked():
+    sys.path.insert(0, str(ROOT))
+    try:
+        from benchmarks.scenes.checks import CHECKS
+    finally:
+        sys.path.remove(str(ROOT))
+    assert set(CHECKS) == set(presets())
+    assert all(len(checks) >= 2 for checks in CHECKS.values())
+    measured = {check.what for checks in CHECKS.values() for check in checks}
+    assert len(measured) > 15
+
+
+def test_the_committed_table_of_scenes_is_green():
+    rows = json.loads((ROOT / "benchmarks" / "results" / "scenes_cpu.json").read_text())["rows"]
+    assert {row["scene"] for row in rows} == set(presets())
+    for row in rows:
+        assert row["seconds"] <= 120
+        assert all(check["holds"] for check in row["checks"]), row["scene"]
+        assert (ROOT / "docs" / "images" / "gallery" / f"{row['scene']}.png").is_file()

@@ -4,12 +4,12 @@ import datetime
 import json
 from pathlib import Path
 
-import imageio.v3 as iio
 import jax
 import numpy as np
 from PIL import Image
 
 from benchmarks.speed.report import cpu
+from pgjax.render import load_video, save_image
 from pgjax.scenes import Plan, presets, resolve
 
 COMMAND = "python -m benchmarks.scenes"
@@ -28,7 +28,8 @@ def law(plan: Plan) -> str:
     names = []
     for material in plan.scene.materials:
         flow = material.plasticity
-        names.append(type(material.elasticity).__name__ + (f", {type(flow).__name__}" if flow else ""))
+        plastic = f", {type(flow).__name__}" if flow else ""
+        names.append(type(material.elasticity.elastic()).__name__ + plastic)
     return "; ".join(dict.fromkeys(names))
 
 
@@ -80,10 +81,10 @@ def write(path: Path, rows: list[dict]) -> None:
 
 def write_strip(path: Path, video: Path) -> None:
     """Three moments of a video side by side."""
-    frames = np.asarray(iio.imread(video))
+    frames = load_video(video).pictures / 255
     strip = np.concatenate([frames[round(m * (len(frames) - 1))] for m in _MOMENTS], axis=1)
     path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, strip[::2, ::2] if strip.shape[0] > 480 else strip)
+    save_image(path, strip[::2, ::2] if strip.shape[0] > 480 else strip)
 
 
 def write_sheet(path: Path, strips: list[Path]) -> None:
@@ -100,7 +101,7 @@ def write_sheet(path: Path, strips: list[Path]) -> None:
     for i, row in enumerate(rows):
         for j, thumb in enumerate(row):
             sheet[i * _THUMB : (i + 1) * _THUMB, j * _THUMB : (j + 1) * _THUMB] = thumb
-    iio.imwrite(path, sheet)
+    save_image(path, sheet / 255)
 
 
 def _centred(wide: int) -> slice:
