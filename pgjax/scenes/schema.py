@@ -96,7 +96,7 @@ def scene_from(root: Table, name: str, quality: str | None = None) -> SceneFile:
     All its qualities are checked, whichever is wanted.
     """
     plain, variants = root.variants("quality", _VARIED)
-    scenes = {None: plain.read(lambda table: _scene(table, name))}
+    scenes: dict[str | None, SceneFile] = {None: plain.read(lambda table: _scene(table, name))}
     for key, variant in variants.items():
         scenes[key] = variant.read(lambda table: _scene(table, name))
     if quality not in scenes:
