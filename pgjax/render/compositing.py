@@ -117,6 +117,8 @@ def _over_items(
     sums = jnp.zeros((grid.count, table.shape[1] - 6, pixels), table.dtype)
 
     def add(state: tuple[Array, Array], items: tuple[Array, Array, Array]):
+        """What a batch of items adds to the tiles; nothing where only padding is left."""
+
         def some(state: tuple[Array, Array]) -> tuple[Array, Array]:
             carry, sums = state
             owner, member, begins = items

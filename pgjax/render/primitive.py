@@ -57,6 +57,7 @@ def _one_by_one(one: Callable[..., Arrays]) -> Callable[..., Arrays]:
     """A plain function for operands with a batch axis of length 1 or n: a loop over the batch."""
 
     def many(*operands: Array, **static: Any) -> Arrays:
+        """The results of each member, stacked."""
         if _batch_size(*(a.shape for a in operands)) == 1:
             return tuple(r[None] for r in one(*(a[0] for a in operands), **static))
         own = [a for a in operands if a.shape[0] != 1]

@@ -65,6 +65,7 @@ def _orbits(t: Table, keys: list[Table], first: Orbit) -> OrbitPath:
     orbits = [first]
 
     def read(key: Table) -> None:
+        """Add the orbit of a key frame."""
         before = orbits[-1]
         orbits.append(
             dataclasses.replace(
@@ -89,6 +90,7 @@ def _looks(t: Table, keys: list[Table], base: Orbit) -> LookPath:
     looks: list[Look] = []
 
     def read(key: Table) -> None:
+        """Add the eye of a key frame."""
         eye, target, fov = looks[-1] if looks else (REQUIRED, base.target, base.fov)
         look = Look(
             key.vector("eye", eye),
