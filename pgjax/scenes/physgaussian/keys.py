@@ -6,6 +6,7 @@ included. The reference passes over keys it does not know; here they are errors.
 
 import dataclasses
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -147,10 +148,9 @@ def _number(text: str) -> float:
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """The keys of an object, those that are null left out; each may be there once."""
-    names = [name for name, _ in pairs]
-    doubled = next((name for name in names if names.count(name) > 1), None)
-    if doubled is not None:
-        raise ValueError(f"it has the key `{doubled}` twice")
+    doubled = [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]
+    if doubled:
+        raise ValueError(f"it has the key `{doubled[0]}` twice")
     return {name: value for name, value in pairs if value is not None}
 
 
