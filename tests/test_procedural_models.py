@@ -1,14 +1,16 @@
 """The models of all scenes: solids that hang together, the same each time, with colours."""
 
+import dataclasses
 import functools
 
 import jax
 import numpy as np
 import pytest
+from scene_files import DROP, ball, changed
 
-from pgjax.render import concatenate
+from pgjax.render import concatenate, save_ply
 from pgjax.sampling import pieces
-from pgjax.scenes import plan, presets, read_scene, resolve
+from pgjax.scenes import SceneError, plan, presets, read_scene, resolve
 from pgjax.scenes.procedural import MODELS, solids
 from pgjax.scenes.procedural.solids import Places, Solid, filled, plain
 
@@ -163,3 +165,46 @@ def test_the_first_solid_owns_what_is_shared():
     inside = np.linalg.norm(x, axis=1) < 0.18
     assert is_red[inside].all()
     assert not is_red[x[:, 0] > 0.22].any()
+
+
+def test_every_preset_takes_a_capture(tmp_path):
+    path = tmp_path / "ball.ply"
+    save_ply(path, ball(400))
+    for name in presets():
+        made = plan(read_scene(resolve(name)), ply=path)
+        assert made.scene.particle_count > 200
+        assert sum(made.scene.counts) == made.scene.particle_count
+        x, grid = np.asarray(made.state.x, np.float64), made.scene.grid
+        h, lower = float(grid.h), np.asarray(grid.origin)
+        assert np.all(x > lower + h)
+        assert np.all(x < lower + (np.asarray(grid.shape) - 1) * h)
+
+
+LED = """
+[[particles]]
+type = "hold"
+region = { lower = [-1, -1, 5], upper = [1, 1, 6] }
+"""
+
+
+def test_what_does_not_apply_to_a_capture_is_said(tmp_path):
+    path, scene = tmp_path / "ball.ply", tmp_path / "scene.toml"
+    save_ply(path, ball(400))
+    scene.write_text(changed(DROP, ("upper = [1, 1, 0.25]", "upper = [1, 1, -0.9]")) + LED)
+    with pytest.raises(SceneError, match=r"\[\[material\]\] 1 owns no particle"):
+        plan(changed_model(read_scene(scene), path))
+    made = plan(read_scene(scene), ply=path)
+    assert made.scene.counts == (made.scene.particle_count,)
+    assert not made.scene.particle_conditions
+    for table in ("[[material]] 1", "[[particles]] 1"):
+        note = f"capture: nothing is in the region of {table}, which is left out"
+        assert note in made.notes
+    wide = plan(read_scene(resolve("bread")), ply=path)
+    assert any("the grid reaches from" in note for note in wide.notes)
+    assert wide.scene.grid.shape[1] > planned("bread").scene.grid.shape[1]
+
+
+def changed_model(file, path):
+    """The scene with a capture that is written in it."""
+    (model,) = file.models
+    return dataclasses.replace(file, models=(dataclasses.replace(model, ply=path),))

@@ -17,6 +17,7 @@ from pgjax.scenes.conditions import ParticlesPart
 from pgjax.scenes.crowd import Crowd, by_material
 from pgjax.scenes.model import ModelPart
 from pgjax.scenes.reader import SceneError, naming
+from pgjax.scenes.replaced import fitted, with_capture
 from pgjax.scenes.schema import GridPart, SceneFile
 from pgjax.scenes.walls import BoundaryPart, Site
 from pgjax.state import State
@@ -78,7 +79,8 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
 
     Args:
         file: the scene file.
-        ply: a captured model in place of the file's own.
+        ply: a captured model in place of the file's own. What takes nothing of it is left out, and
+            the grid is widened where it does not hold it; notes say so.
         frames: number of frames in place of the file's own.
 
     Raises:
@@ -86,11 +88,12 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
             its time step is too long.
     """
     if ply is not None:
-        file = _with_model(file, ply)
+        file = with_capture(file, ply)
     bodies = [body(part, file.grid.spacing) for part in file.models]
-    crowd, counts = by_material(
-        Crowd.of(file.models, bodies), [part.takes for part in file.materials]
-    )
+    everybody, changes = Crowd.of(file.models, bodies), ()
+    if ply is not None:
+        file, changes = fitted(file, everybody)
+    crowd, counts = by_material(everybody, [part.takes for part in file.materials])
     still = concatenate([b.still for b in bodies])
     with naming(file.source):
         scene = _scene(file, crowd, counts, still)
@@ -111,7 +114,7 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         fps=file.time.fps,
         view=file.camera,
         allow_unstable=file.time.allow_unstable,
-        notes=tuple(note for b in bodies for note in b.notes),
+        notes=(*(note for b in bodies for note in b.notes), *changes),
         models=file.models,
         body=crowd.body,
     )
@@ -143,19 +146,6 @@ def _longest_step(file: SceneFile, scene: Scene, state: State) -> float:
             f"step at rest, but is {file.time.dt:g}."
         )
     return file.time.dt
-
-
-def _with_model(file: SceneFile, ply: Path) -> SceneFile:
-    part, *others = file.models
-    if others:
-        raise SceneError(
-            f"{file.source}: another model can replace the one of a scene with one [model] only, "
-            f"but there are {len(file.models)}."
-        )
-    # A region of a model that a program made is in coordinates that the capture does not have.
-    region = None if part.ply is None else part.region
-    other = dataclasses.replace(part, ply=ply, procedural=None, region=region)
-    return dataclasses.replace(file, models=(other,))
 
 
 def _scene(file: SceneFile, crowd: Crowd, counts: tuple[int, ...], still: Gaussians) -> Scene:
