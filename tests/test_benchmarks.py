@@ -30,6 +30,7 @@ def run_benchmark(name, *options):
 
 
 @pytest.mark.float64
+@pytest.mark.slow
 def test_quick_speed_table_is_whole():
     run = run_benchmark(*SPEED)
     table = rows(run.stdout)

@@ -204,7 +204,7 @@ def test_info(capsys):
         assert word in printed
 
 
-@pytest.mark.parametrize("arguments", [["run"], ["fly"], ["run", "ficus", "--frames", "x"]])
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["run", "ficus", "--frames", "x"]])
 def test_usage_errors(arguments, capsys):
     with pytest.raises(SystemExit) as exit_:
         cli.main(arguments)

@@ -94,7 +94,8 @@ def test_h16_nodes_with_a_tiny_mass(name, holds):
     holds("H16", material=name)
 
 
-@pytest.mark.parametrize("degree", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [2, 3])
 def test_h16_in_space(degree, holds):
     """A corner node has the cube of the smallest weight: below what the precision holds."""
     h = 1e-3
