@@ -27,15 +27,7 @@ E = 2e4
 nu = 0.3
 density = 1000
 """
-DROP = (
-    """
-name = "drop"
-[model]
-ply = "drop.ply"
-size = 0.5"""
-    + GRID
-    + """[forces]
-gravity = [0, 0, -9.81]
+TWO_MATERIALS = """
 [[material]]
 law = "fixed-corotated"
 E = 2e4
@@ -48,7 +40,19 @@ E = 2e4
 nu = 0.3
 density = 500
 plasticity = { type = "von-mises", yield_stress = 200 }
-[[boundary]]
+"""
+DROP = (
+    """
+name = "drop"
+[model]
+ply = "drop.ply"
+size = 0.5"""
+    + GRID
+    + """[forces]
+gravity = [0, 0, -9.81]
+"""
+    + TWO_MATERIALS
+    + """[[boundary]]
 type = "half-space"
 point = [0, 0, -0.05]
 normal = [0, 0, 1]

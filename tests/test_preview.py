@@ -3,7 +3,7 @@
 import matplotlib.image
 import numpy as np
 import pytest
-from scene_files import CAMERA, GRID, JELLY, MODEL, ball, planned, sphere, write
+from scene_files import CAMERA, GRID, JELLY, MODEL, TWO_MATERIALS, ball, planned, sphere, write
 
 from pgjax.cli import main
 from pgjax.render import save_ply
@@ -11,20 +11,6 @@ from pgjax.scenes.marks import domain, marks
 from pgjax.scenes.preview import figure
 
 SMALL = CAMERA.replace("64", "32").replace("48", "24")
-TWO_MATERIALS = """
-[[material]]
-law = "fixed-corotated"
-E = 2e4
-nu = 0.3
-density = 1000
-region = { lower = [-1, -1, -1], upper = [1, 1, 0.25] }
-[[material]]
-law = "stvk-hencky"
-E = 2e4
-nu = 0.3
-density = 500
-plasticity = { type = "von-mises", yield_stress = 200 }
-"""
 FORCES = """
 [forces]
 gravity = [0, 0, -9.81]
