@@ -201,7 +201,9 @@ def scene_of(d, mapping=None):
 
 
 @pytest.mark.float64
-@pytest.mark.parametrize("mapping", [None, models.DruckerPrager(30.0)])
+@pytest.mark.parametrize(
+    "mapping", [pytest.param(None, marks=pytest.mark.slow), models.DruckerPrager(30.0)]
+)
 def test_every_transformation_of_a_rollout(mapping):
     """Nested batches, both modes and both of one another, checkpoints: as one by one."""
     scene, state = scene_of(3, mapping)

@@ -156,6 +156,7 @@ def test_noise_gives_intervals():
 
 
 @float64
+@pytest.mark.slow
 def test_coverage(measure):
     """Over 400 replicates the 90 % interval holds the truth in 85 to 95 %."""
     problem = elastic_problem(frames=6, unknowns=parameters(nu=Parameter(0.3, fixed=True)))

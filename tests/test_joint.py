@@ -30,6 +30,7 @@ def throw(name, *, frames=6, noise=0.0, seed=0, E=None):
     return problem.observing(Positions(data, sigma=max(noise, 1e-3)))
 
 
+@pytest.mark.float64
 def test_is_its_parts():
     parts = [throw("v_one"), throw("v_two", frames=4)]
     joint = Joint(parts)
@@ -80,6 +81,7 @@ def test_parts_have_to_agree():
         Joint([throw("v_one")]).until(0)
 
 
+@pytest.mark.float64
 def test_a_motion_the_time_step_is_not_made_for_is_no_gain():
     # At the upper bound the step is 0.997 of the sharp limit at rest: any deformation is too much.
     E = Parameter(8e3, lower=2e3, upper=6.9e4, log=True)

@@ -120,6 +120,7 @@ def test_fit_from_silhouettes():
     np.testing.assert_allclose(found.values["v0"], TRUTH["v0"], atol=5e-3)
 
 
+@pytest.mark.float64
 def test_squares_are_averages():
     """Of the differences, over the noise of an average; what is missing counts as no difference."""
     problem = pictured("rgb", 2, frames=2)

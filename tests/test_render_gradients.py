@@ -196,6 +196,7 @@ def test_gradients_are_finite(antialiased):
         assert not np.any(leaf[jnp.asarray([0, 60, 62, 66])])
 
 
+@pytest.mark.float64
 def test_a_clamped_alpha_and_an_empty_pixel_have_no_derivative():
     ones = floats(np.ones((1, 3)))
     scene = Gaussians.from_scales(

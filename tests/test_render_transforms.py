@@ -70,7 +70,11 @@ def operands(rule, channels=4, seed=0):
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("rule", "channels"), [(RULES[0], 4), (RULES[1], 7)], ids=["3dgs", "smooth"]
+    ("rule", "channels"),
+    [
+        pytest.param(RULES[0], 4, id="3dgs"),
+        pytest.param(RULES[1], 7, id="smooth", marks=pytest.mark.slow),
+    ],
 )
 def test_native_and_plain_agree(monkeypatch, rule, channels):
     """Image, tangent and adjoint; single, batched, and with shared and own operands."""

@@ -98,6 +98,7 @@ def test_degrees_may_differ(ours, theirs):
     assert_same(image, render(concatenate([moving, still]), CAMERA))
 
 
+@pytest.mark.float64
 def test_there_may_be_none_of_either():
     moving, still = halves()
     assert_same(prepare_surroundings(still[:0], CAMERA).render(moving), render(moving, CAMERA))
@@ -109,6 +110,7 @@ def loss(image):
     return jnp.sum((image.rgb - target) ** 2) + jnp.sum(image.depth)
 
 
+@pytest.mark.float64
 def test_derivatives_are_those_of_all_together():
     """Of what moves, of what stands still where it is prepared inside, and forward as reverse."""
     moving, still = halves()

@@ -232,6 +232,7 @@ def test_tangents_share_their_primal():
     assert f"tensor<1x{case.xi.shape[0]}x3x" in text  # positions, once
 
 
+@pytest.mark.float64
 def test_second_order_and_rematerialisation():
     case = Case(2, 3, True, particles=8)
     arguments = (case.xi, *case.payload, case.g)

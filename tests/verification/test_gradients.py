@@ -200,6 +200,7 @@ def test_taylor_remainder(measure):
     measure("G2", "part of the remainders without a flip", counted / possible, above=0.95)
 
 
+@pytest.mark.slow
 def test_single_precision_derivatives(measure):
     """G3: float32 against float64, for each block the frames before its first flip."""
     p, dt = base()
