@@ -27,7 +27,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 install_import_hook("pgjax", "typecheck.check")
 
-# Tracing makes millions of objects that form no cycles; looking for some took an eighth of the time.
+# Tracing makes millions of objects that form no cycles; looking for some took an eighth of it.
 gc.freeze()
 gc.set_threshold(200_000, 20, 100)
 
