@@ -1,4 +1,4 @@
-"""Columns of sand, water, paste and metal that collapse: scenes of V35 to V38."""
+"""Sand on a slope, columns of sand, water, paste and metal that collapse: V30, V35 to V38."""
 
 from typing import NamedTuple
 
@@ -21,6 +21,49 @@ def wall(axis, d, contact):
     return Collider(HalfSpace(np.zeros(d), np.eye(d)[axis]), contact)
 
 
+# --- V30: sand on a slope ------------------------------------------------------------------------
+
+
+def along(scene, state):
+    """Velocity along the slope."""
+    del scene
+    return state.v[:, 0]
+
+
+def acceleration(theta):
+    """`g (sin θ − 3α/√2 cos θ)`, m/s²: of sand of φ = 30° that flows in plane strain."""
+    alpha = (2 / 3) ** 0.5 * 2 * 0.5 / (3 - 0.5)
+    return G * (np.sin(theta) - 3 * alpha / 2**0.5 * np.cos(theta))
+
+
+def slope(ny, theta, seconds, *, per_cell=2):
+    """Sand of depth 1 m on an infinite rough slope, released at its stress at rest.
+
+    Returns:
+        Times, and the mean velocity of the upper quarter along the slope.
+    """
+    E, nu, density = 1e7, 0.3, 1500.0
+    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    h, frames = 1 / ny, 60
+    X = lattice((0, 0), (1, ny), h, per_cell)
+    down, forth = -G * np.cos(theta), G * np.sin(theta)
+    strain = density * down * (1 - X[:, 1]) / (lam + 2 * mu)
+    F = np.tile(np.eye(3), (len(X), 1, 1))
+    F[:, 1, 1] = np.exp(strain)
+    scene = Scene(
+        Grid(np.zeros(2), (1, ny + 4), h, periodic=(True, False)),
+        pm.Material(pm.StVKHencky(E, nu), pm.DruckerPrager(30.0), density),
+        (h / per_cell) ** 2 / np.exp(strain),
+        gravity=[forth, down],
+        boundaries=(wall(1, 2, Sticky()),),
+    )
+    dt = 0.5 * float(scene.elastic_limit(scene.rest_sound_speed()))
+    every = int(seconds / dt / frames)
+    state = initial_state(scene, X, F=F)
+    _, v = roll(scene, state, dt, every * frames, along, every=every)
+    return dt * every * np.arange(1, frames + 1), wide(v)[:, X[:, 1] > 0.75].mean(axis=1)
+
+
 # --- V35: sand ------------------------------------------------------------------------------------
 
 
@@ -29,7 +72,7 @@ class Deposit(NamedTuple):
 
     Attributes:
         runout: how far 99 % of the mass advanced.
-        height: of the highest particle, and a quarter of a cell.
+        height: of the highest particle, and half its own.
         lowest: the lowest particle, in cells.
         energy: kinetic, over the potential one at first.
         lost: part of the mass that left.
@@ -42,7 +85,7 @@ class Deposit(NamedTuple):
     lost: float
 
 
-def collapse(aspect, phi, *, n=16, base=None, correct=True):
+def collapse(aspect, phi, *, n=16, base=None, correct=True, per_cell=2):
     """A column of sand 0.2 m wide and `aspect` times as high, for 5 √(H/g).
 
     Args:
@@ -51,15 +94,16 @@ def collapse(aspect, phi, *, n=16, base=None, correct=True):
         n: cells of its width.
         base: contact with the ground; sticky if None.
         correct: whether the sand remembers the volume it gained (see `DruckerPrager`).
+        per_cell: particles in each direction of a cell.
     """
     width = 0.2
     h, height = width / n, aspect * width
-    X = lattice((0, 0), (n, round(aspect * n)), h)
+    X = lattice((0, 0), (n, round(aspect * n)), h, per_cell)
     sand = pm.DruckerPrager(phi, volume_correction=correct)
     scene = Scene(
         Grid(np.zeros(2), (round((3 + 2 * aspect) * n), round(aspect * n) + 4), h),
         pm.Material(pm.StVKHencky(4e5, 0.3), sand, 1500.0),
-        np.full(len(X), (h / 2) ** 2),
+        np.full(len(X), (h / per_cell) ** 2),
         gravity=[0.0, -G],
         boundaries=(wall(0, 2, Slip()), wall(1, 2, base or Sticky())),
     )
@@ -68,7 +112,7 @@ def collapse(aspect, phi, *, n=16, base=None, correct=True):
     mass, x = wide(scene.masses), wide(end.x)
     return Deposit(
         runout=np.quantile(x[:, 0], 0.99) / width - 1,
-        height=(x[:, 1].max() + h / 4) / width,
+        height=(x[:, 1].max() + h / (2 * per_cell)) / width,
         lowest=x[:, 1].min() / h,
         energy=float(kinetic_energy(scene, end)) / (mass.sum() * G * height / 2),
         lost=1 - mass[np.asarray(end.alive)].sum() / mass.sum(),

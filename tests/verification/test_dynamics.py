@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from discs import NU, RADIUS, RHO, collide
 from scenes import SCHEMES, kinetic_energy, lattice, momenta, roll, wide, without_affine
 
 import pgjax.models as pm
@@ -13,13 +14,10 @@ from pgjax._types import parameter
 from pgjax.boundary import Box, Separating, Slip, Sticky
 from pgjax.grid import Grid
 from pgjax.models.elasticity import AbstractElasticity
-from pgjax.sampling import ball
 from pgjax.scene import Scene, initial_state
 from pgjax.step import step
 
 pytestmark = pytest.mark.float64
-
-NU, RHO, RADIUS = 0.3, 1000.0, 0.2
 
 
 # --- V21: two elastic discs ----------------------------------------------------------------------
@@ -31,47 +29,6 @@ LEFT = {
     "cubic-grad": (0.521, 0.723),
 }
 LEAST = {20: 1.94, 40: 2.04}
-
-
-def two_discs(n, name):
-    """Two discs on the diagonal of the unit square that approach each other; E = 1000 Pa.
-
-    Returns:
-        Scene, state, and a time step of 0.2 h/c with the speed of waves of compression.
-    """
-    E, speed, h = 1000.0, 0.1, 1 / n
-    spline, scheme, _ = SCHEMES[name]
-    parts = [ball((c, c), RADIUS, h / 2) for c in (0.2, 0.8)]
-    x, volumes = (np.concatenate(a) for a in zip(*parts, strict=True))
-    scene = Scene(
-        Grid([-4 * h, -4 * h], (n + 8, n + 8), h),
-        pm.Material(pm.FixedCorotated(E, NU), density=RHO),
-        volumes,
-        spline=spline,
-        scheme=scheme,
-    )
-    towards = np.where(np.arange(len(x)) < len(x) // 2, speed, -speed)
-    mu, lam = energies.lame(E, NU)
-    state = initial_state(scene, x, towards[:, None] * np.ones(2))
-    return scene, state, 0.2 * h / ((lam + 2 * mu) / RHO) ** 0.5
-
-
-def energy_and_momentum(scene, state):
-    """Total and kinetic energy, J, and momentum."""
-    total = energies.total(scene, state, energies.fixed_corotated)
-    return total, kinetic_energy(scene, state), momenta(scene, state)[0]
-
-
-def collide(n, name, *, courant=1.0, seconds=3.5, **kwargs):
-    """Times, total and kinetic energy over the exact one at the start, and `P/Σ m|v|`."""
-    scene, state, dt = two_discs(n, name)
-    dt *= courant
-    _, seen = roll(scene, state, dt, round(seconds / dt), energy_and_momentum, **kwargs)
-    total, kinetic, P = map(wide, seen)
-    # ½ m v² of two discs, v = 0.1 (1, 1) m/s: 2.5133 J.
-    mass = 2 * np.pi * RADIUS**2 * RHO
-    start, size = mass * 0.01, mass * 0.02**0.5
-    return dt * np.arange(1, len(total) + 1), total / start, kinetic / start, P / size
 
 
 @pytest.mark.parametrize(

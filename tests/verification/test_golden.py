@@ -6,8 +6,8 @@ with what `python tests/verification/test_golden.py` prints.
 
 import jax
 import pytest
-import test_dynamics
 import variants
+from discs import collide
 from flows import collapse
 
 pytestmark = pytest.mark.float64
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.float64
 
 def discs(name):
     """V21: two discs, n = 20, after the impact."""
-    t, total, kinetic, _ = test_dynamics.collide(20, name)
+    t, total, kinetic, _ = collide(20, name)
     return {
         "energy that is left": total[-1],
         "least kinetic energy": kinetic.min(),

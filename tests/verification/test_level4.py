@@ -3,12 +3,9 @@
 import manufactured
 import numpy as np
 import pytest
-from scenes import SCHEMES, MissingTimeStep, lattice, roll, wide, without_affine
-
-import pgjax.models as pm
-from pgjax.boundary import Collider, HalfSpace, Slip, Sticky
-from pgjax.grid import Grid
-from pgjax.scene import Scene, initial_state
+from bars import free_bar
+from flows import acceleration, slope
+from scenes import SCHEMES, MissingTimeStep, without_affine
 
 pytestmark = pytest.mark.float64
 
@@ -69,40 +66,6 @@ def test_v24_fails_without_the_time_step_of_the_trial_state(measure):
     measure("V24", "negative control: F with Δt missing (E1)", error, above=2 * demand)
 
 
-def heights(scene, state):
-    """Vertical positions."""
-    del scene
-    return state.position[:, 1]
-
-
-def free_bar(n, name, **kwargs):
-    """A bar on a roller, free at the other end, in its first mode: period error and loss.
-
-    Laterally confined, so the wave speed is `c = √((λ + 2μ)/ρ)` and the period `4 L/c`, L = 1.
-    """
-    spline, scheme, _ = SCHEMES[name]
-    h, c = 1 / n, manufactured.SPEED
-    Y = lattice((0, 0), (1, n), h)
-    scene = Scene(
-        Grid(np.zeros(2), (1, n + 4), h, periodic=(True, False)),
-        pm.Material(pm.NeoHookean(manufactured.E, manufactured.NU), density=manufactured.RHO),
-        np.full(len(Y), (h / 2) ** 2),
-        boundaries=(Collider(HalfSpace([0.0, 0.0], [0.0, 1.0]), Slip()),),
-        spline=spline,
-        scheme=scheme,
-    )
-    mode = np.sin(np.pi * Y[:, 1] / 2)
-    v = np.stack([0 * mode, 1e-4 * c * mode], axis=1)
-    dt, period = 0.2 * h / c, 4 / c
-    steps = int(2.2 * period / dt)
-    _, y = roll(scene, initial_state(scene, Y, v), dt, steps, heights, **kwargs)
-    q = (wide(y) - Y[:, 1]) @ mode
-    before = np.flatnonzero(q[:-1] * q[1:] < 0)[:4]
-    crossings = dt * (before + 1 + q[before] / (q[before] - q[before + 1]))
-    first, third = np.abs(q[: before[0]]).max(), np.abs(q[before[1] : before[2]]).max()
-    return crossings[3] / (2 * period) - 1, 1 - third / first
-
-
 BARS = {
     "quadratic-grad": (8, 16, 32, 64),
     "quadratic-mls": (8, 16, 32, 64),
@@ -141,50 +104,15 @@ def test_v27_fails_without_the_affine_velocity(measure):
     measure("V27", "negative control: amplitude PIC loses, n = 32", loss, above=0.1)
 
 
-def speed_and_slope(scene, state):
-    """Velocity along the slope."""
-    del scene
-    return state.v[:, 0]
-
-
-def slope(ny, theta, seconds):
-    """Sand of depth 1 m on an infinite rough slope, released at its stress at rest.
-
-    Returns:
-        Times, and the mean velocity of the upper quarter along the slope.
-    """
-    E, nu, density, g = 1e7, 0.3, 1500.0, 9.8
-    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
-    h, frames = 1 / ny, 60
-    X = lattice((0, 0), (1, ny), h)
-    down, along = -g * np.cos(theta), g * np.sin(theta)
-    strain = density * down * (1 - X[:, 1]) / (lam + 2 * mu)
-    F = np.tile(np.eye(3), (len(X), 1, 1))
-    F[:, 1, 1] = np.exp(strain)
-    scene = Scene(
-        Grid(np.zeros(2), (1, ny + 4), h, periodic=(True, False)),
-        pm.Material(pm.StVKHencky(E, nu), pm.DruckerPrager(30.0), density),
-        (h / 2) ** 2 / np.exp(strain),
-        gravity=[along, down],
-        boundaries=(Collider(HalfSpace([0.0, 0.0], [0.0, 1.0]), Sticky()),),
-    )
-    dt = 0.5 * float(scene.elastic_limit(scene.rest_sound_speed()))
-    every = int(seconds / dt / frames)
-    state = initial_state(scene, X, F=F)
-    _, v = roll(scene, state, dt, every * frames, speed_and_slope, every=every)
-    return dt * every * np.arange(1, frames + 1), wide(v)[:, X[:, 1] > 0.75].mean(axis=1)
-
-
 @pytest.mark.parametrize(
     "angles", [(34.0, 35.5), pytest.param((40.0, 45.0), marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize(("ny", "tolerance"), [(16, 0.15), (32, 0.06)])
 def test_v30_infinite_slope_of_sand(measure, ny, tolerance, angles):
     """`a = g (sin θ − 3α/√2 cos θ)`; φ = 30° stays at rest up to 34.7° in plane strain."""
-    alpha = (2 / 3) ** 0.5 * 2 * 0.5 / (3 - 0.5)
     for degrees in angles:
         theta = np.deg2rad(degrees)
-        expected = 9.8 * (np.sin(theta) - 3 * alpha / 2**0.5 * np.cos(theta))
+        expected = acceleration(theta)
         t, v = slope(ny, theta, 1.5)
         case = f"{degrees}°, {ny} cells deep"
         if expected < 0:

@@ -1,5 +1,6 @@
 """Level 5: single precision (V43), and one motion however it is run (V44; see `test_rollout`)."""
 
+import discs
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +8,6 @@ import manufactured
 import numpy as np
 import pytest
 import scenes
-import test_dynamics
 import variants
 from flows import collapse
 
@@ -68,7 +68,7 @@ def test_v43_two_discs(measure, monkeypatch, n):
     """V21: what the energy does, over the part that the grid takes."""
 
     def run():
-        t, total, kinetic, _ = test_dynamics.collide(n, "quadratic-grad")
+        t, total, kinetic, _ = discs.collide(n, "quadratic-grad")
         return total, kinetic, t[kinetic.argmin()]
 
     double, single = in_both(run, monkeypatch)
