@@ -12,7 +12,7 @@ import numpy as np
 
 from pgjax import native
 from pgjax._safe import safe_divide
-from pgjax._types import Array, Float, Int
+from pgjax._types import Array, Bool, Float, Int
 from pgjax.boundary.contact import AbstractContact, Separating, Slip, Sticky
 from pgjax.exchange import Received, Receiver, Sender, Sent, receive, send
 from pgjax.models.elasticity import RESPONSES
@@ -50,8 +50,9 @@ def _per_particle(values: Array, count: int) -> Array:
 
 
 def _send_plain(
-    *operands: Array, law: str, degree: int, nodes: tuple[int, ...], mls: bool
+    *operands: Array, law: str, degree: int, nodes: tuple[int, ...], mls: bool, whole: bool
 ) -> Arrays:
+    del whole  # All nodes are cleared.
     *own, mu, lam, numbers = operands
     p = Sender(*own)
     n = p.xi.shape[0]
@@ -64,7 +65,10 @@ def _send_plain(
 
 
 def _velocities_plain(*operands: Array, contact: str) -> Arrays:
-    *sides, nodes, numbers, friction = operands
+    *sides, box, nodes, numbers, friction = operands
+    if box.size:
+        # Whatever a kernel left outside.
+        nodes = jnp.where(_in_box(box, nodes.shape[:-1])[..., None], nodes, 0)
     mass = nodes[..., -1:]
     v = safe_divide(nodes[..., :-1], jnp.broadcast_to(mass, nodes[..., :-1].shape))
     v = numbers[0] * (v + jnp.broadcast_to(numbers[1:], v.shape))
@@ -73,6 +77,14 @@ def _velocities_plain(*operands: Array, contact: str) -> Arrays:
         for axis, side in enumerate(sides[: v.ndim - 1]):
             v = _touched(wall, axis, side, v)
     return (jnp.concatenate([jnp.where(mass > 0, v, 0), mass], axis=-1),)
+
+
+def _in_box(box: Int[Array, " _"], shape: tuple[int, ...]) -> Bool[Array, "*grid"]:
+    """Which nodes of a grid are in a box (see `velocities`)."""
+    d = len(shape)
+    places = jnp.indices(shape, box.dtype)
+    first, end = (a.reshape(d, *[1] * d) for a in (box[:d], box[d:]))
+    return jnp.all((places >= first) & (places < end), axis=0)
 
 
 def _touched(contact: AbstractContact, axis: int, side: Array, v: Array) -> Array:
@@ -125,14 +137,21 @@ def _packed_type(like: Any) -> jax.ShapeDtypeStruct:
 
 
 def _send_native(
-    operands: list[Array], types: list[Any], *, law: str, degree: int, mls: bool, **_: Any
+    operands: list[Array],
+    types: list[Any],
+    *,
+    law: str,
+    degree: int,
+    mls: bool,
+    whole: bool,
+    **_: Any,
 ) -> Arrays | None:
     target = _kernel_of("send", "exchange", operands[Sender._fields.index("xi")])
     if target is None:
         return None
     grid, *others = types
     made, *rest = jax.ffi.ffi_call(target, [_packed_type(grid), *others])(
-        *operands, **_attributes(_LAWS.index(law), degree, mls)
+        *operands, **_attributes(_LAWS.index(law), degree, mls), whole=np.bool_(whole)
     )
     return made[..., : grid.shape[-1]], *rest
 
@@ -259,7 +278,7 @@ _velocities = stage(
     _velocities_plain,
     1,
     _velocities_native,
-    masks=3,
+    masks=4,
     tangent=_velocities_tangent,
     pull=_velocities_pull,
 )
@@ -283,11 +302,15 @@ def send_natively(
     *,
     degree: int,
     nodes: tuple[int, ...],
+    whole: bool = True,
 ) -> Sent:
-    """`send` for a law of `RESPONSES` with its parameters μ and λ, Pa, as one native call."""
+    """`send` for a law of `RESPONSES` with its parameters μ and λ, Pa, as one native call.
+
+    Unless the whole grid is wanted, nodes outside the box of all stencils may hold anything.
+    """
     mu, lam = map(jnp.atleast_1d, parameters)
-    mls = isinstance(scheme, MLS)
-    return Sent(*_send(*p, mu, lam, numbers, law=law, degree=degree, nodes=nodes, mls=mls))
+    static = {"law": law, "degree": degree, "nodes": nodes, "mls": isinstance(scheme, MLS)}
+    return Sent(*_send(*p, mu, lam, numbers, **static, whole=whole))
 
 
 def velocities(
@@ -295,6 +318,7 @@ def velocities(
     kept: Float[Array, ""],
     gained: Float[Array, " d"],
     walls: tuple[AbstractContact, list[Int[Array, " _"]]] | None = None,
+    box: Int[Array, " _"] | None = None,
 ) -> Float[Array, "*grid c"]:
     """From momentum and mass to velocity and mass; an empty node is at rest.
 
@@ -304,13 +328,16 @@ def velocities(
         gained: what gravity adds to it before.
         walls: contact of a box, and for the nodes along each direction −1 behind its lower wall,
             1 behind its upper one, 0 elsewhere, int8.
+        box: first node along each direction and end of the nodes that may have mass, int32
+            `(2 d,)`; all of them if None. The others may hold anything, before and after.
     """
     numbers = jnp.concatenate([kept[None], gained])
     contact, sides = (None, []) if walls is None else walls
     friction = contact.friction if isinstance(contact, Separating) else jnp.zeros((), nodes.dtype)
     padded = [*sides, *[jnp.zeros((0,), jnp.int8)] * (3 - len(sides))]
+    box = jnp.zeros((0,), jnp.int32) if box is None else box
     name = _CONTACTS[_CONTACT_TYPES.index(type(contact))]
-    return _velocities(*padded, nodes, numbers, friction[None], contact=name)[0]
+    return _velocities(*padded, box, nodes, numbers, friction[None], contact=name)[0]
 
 
 def receive_natively(

@@ -1,6 +1,7 @@
 """One time step of the Material Point Method, written as the algorithm reads."""
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,11 +11,11 @@ import numpy as np
 
 from pgjax import native
 from pgjax._safe import safe_divide
-from pgjax._types import Array, Bool, Float, Scalar
+from pgjax._types import Array, Bool, Float, Int, Scalar
 from pgjax.boundary import AbstractGridCondition, Box, Particles, Region, sweep
 from pgjax.exchange import EVENTS, Receiver, Sender, embed, is_finite, receive, send, where
 from pgjax.fused import known, receive_natively, send_natively, velocities
-from pgjax.grid import Grid
+from pgjax.grid import PAD, Grid
 from pgjax.models.law import AbstractElasticity, Response
 from pgjax.models.material import Material, cast, particle_axes
 from pgjax.result import Condition
@@ -23,6 +24,9 @@ from pgjax.state import State
 from pgjax.transfer import MLS, SplineGradient, Stencil, stencil
 
 Vectors = Float[Array, "d n"]
+
+# From so many nodes for each particle on, those without mass cost more than to leave them out.
+_EMPTY = 4
 
 
 def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
@@ -39,7 +43,7 @@ def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
     Returns:
         The state one step later. Differentiable in every array of `scene` and `state`.
     """
-    return followed_step(scene, state, dt).after
+    return followed_step(scene, state, dt, whole=not _leaves_nodes_out(scene)).after
 
 
 class Stages(NamedTuple):
@@ -58,21 +62,35 @@ class Stages(NamedTuple):
     after: State
 
 
-def followed_step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> Stages:
-    """`step` with what lies between, for whoever keeps accounts."""
+def followed_step(
+    scene: Scene, state: State, dt: Float[Array, ""] | float, *, whole: bool = True
+) -> Stages:
+    """`step` with what lies between, for whoever keeps accounts.
+
+    Unless the whole grid is wanted, nodes outside the box of all stencils may hold anything.
+    """
     scene = cast(scene, state.dtype)
     dt = jnp.asarray(dt, state.dtype)
     t = state.step.astype(state.dtype) * dt
 
-    held, imposed = _impose(scene, state, t, dt)
+    held, imposed = impose(scene, state, t, dt)
     at, inside = stencil(scene.grid, scene.spline, imposed.position)
-    sent, finite, nodes = _particles_to_grid(scene, imposed, at, inside, t, dt)
-    moved = _forces_and_boundaries(scene, at, nodes, t, dt)
-    after = _grid_to_particles(scene, sent, at, finite, held, moved, dt)
+    sent, finite, nodes = particles_to_grid(scene, imposed, at, inside, t, dt, whole=whole)
+    box = None if whole else box_of(scene.grid, at)
+    moved = forces_and_boundaries(scene, region_of(scene.grid, at), nodes, t, dt, box=box)
+    after = grid_to_particles(scene, sent, at, finite, held, moved, dt)
     return Stages(imposed, nodes, moved, after)
 
 
-def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Array, " p"], State]:
+def _leaves_nodes_out(scene: Scene) -> bool:
+    """Whether the passes keep to the nodes that have mass: in a grid that is mostly empty."""
+    box, *others = scene.boundaries or (None,)
+    walls = box is None or (isinstance(box, Box) and known(box.contact))
+    apart = not any(scene.grid.periodic) and walls and not others and native.available()
+    return apart and math.prod(scene.grid.padded_shape) > _EMPTY * scene.particle_count
+
+
+def impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Array, " p"], State]:
     """Body forces, prescribed velocities and pushes; which particles are held in this step.
 
     They act before anything is checked, so that a NaN from a user's function is found.
@@ -96,8 +114,15 @@ def _impose(scene: Scene, state: State, t: Scalar, dt: Scalar) -> tuple[Bool[Arr
     return particles.held, eqx.tree_at(lambda s: (s.v, s.C), state, (v, C))
 
 
-def _particles_to_grid(
-    scene: Scene, state: State, at: Stencil, inside: Bool[Array, " p"], t: Scalar, dt: Scalar
+def particles_to_grid(
+    scene: Scene,
+    state: State,
+    at: Stencil,
+    inside: Bool[Array, " p"],
+    t: Scalar,
+    dt: Scalar,
+    *,
+    whole: bool = True,
 ) -> tuple[State, Bool[Array, " p"], Float[Array, "*grid c"]]:
     """Momentum and mass of the nodes, the internal forces already in the momentum.
 
@@ -121,7 +146,8 @@ def _particles_to_grid(
     known_law = _native_law(scene)
     if known_law is not None:
         name, law = known_law
-        sent = send_natively(particles, name, (law.mu, law.lam), scene.scheme, numbers, **shape)
+        moduli = law.mu, law.lam
+        sent = send_natively(particles, name, moduli, scene.scheme, numbers, **shape, whole=whole)
     else:
         respond = functools.partial(_respond, scene, state.history, t)
         sent = send(particles, respond, scene.scheme, numbers, **shape)
@@ -165,20 +191,27 @@ def _respond(
     return Response(*(jnp.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def _forces_and_boundaries(
-    scene: Scene, at: Stencil, momentum_and_mass: Float[Array, "*grid c"], t: Scalar, dt: Scalar
+def forces_and_boundaries(
+    scene: Scene,
+    region: Region,
+    momentum_and_mass: Float[Array, "*grid c"],
+    t: Scalar,
+    dt: Scalar,
+    *,
+    box: Int[Array, " _"] | None = None,
 ) -> Float[Array, "*grid c"]:
     """Velocity of the nodes, and their mass: gravity, damping, then each condition in order.
 
-    Damping is `exp(−γ Δt)`. Empty nodes stay at rest.
+    Damping is `exp(−γ Δt)`. Empty nodes stay at rest. No node outside the region has mass.
     """
     kept, gained = jnp.exp(-scene.grid_damping * dt), dt * scene.gravity
     if not scene.boundaries:
-        return velocities(momentum_and_mass, kept, gained)
-    box, *others = scene.boundaries
-    if isinstance(box, Box) and not others and known(box.contact) and native.available():
+        return velocities(momentum_and_mass, kept, gained, box=box)
+    walls, *others = scene.boundaries
+    if isinstance(walls, Box) and not others and known(walls.contact) and native.available():
         axes = [a + start for a, start in zip(scene.grid.axes(), scene.grid.origin, strict=True)]
-        return velocities(momentum_and_mass, kept, gained, (box.contact, box.sides(axes)))
+        touched = walls.contact, walls.sides(axes)
+        return velocities(momentum_and_mass, kept, gained, touched, box=box)
 
     def constrained(x: Vectors, momentum_and_mass: Float[Array, "c n"], region: Region) -> Array:
         """Of n nodes, components first."""
@@ -192,10 +225,17 @@ def _forces_and_boundaries(
                 v = jax.vmap(condition, in_axes=(1, 1, None), out_axes=1)(x, v, t)
         return jnp.concatenate([jnp.where(mass > 0, v, 0), mass])
 
-    return sweep(scene.grid, constrained, momentum_and_mass, _region(scene.grid, at))
+    return sweep(scene.grid, constrained, momentum_and_mass, region)
 
 
-def _region(grid: Grid, at: Stencil) -> Region:
+def box_of(grid: Grid, at: Stencil) -> Int[Array, " _"]:
+    """First node of all stencils along each direction, and the end: numbers in the padded grid."""
+    first, last = at.span()
+    box = jnp.concatenate([first, last + 1]).astype(jnp.int32) + PAD
+    return jnp.clip(box, 0, np.tile(np.asarray(grid.padded_shape, np.int32), 2))
+
+
+def region_of(grid: Grid, at: Stencil) -> Region:
     """The box of all nodes that can have mass, half a cell wider on each side."""
     first, last = at.span()
     wide = np.asarray(grid.periodic)
@@ -204,7 +244,7 @@ def _region(grid: Grid, at: Stencil) -> Region:
     return Region(low, high)
 
 
-def _grid_to_particles(
+def grid_to_particles(
     scene: Scene,
     state: State,
     at: Stencil,

@@ -26,13 +26,18 @@ Run = Callable[..., Any]
 def one_step(run: Run, scene: Any, state: Any, dt: Any) -> None:
     """The stages of `pgjax.step.step`, in its order; adapt it with that function."""
     t = jnp.zeros_like(dt)
-    held, state = run("impose", step._impose, scene, state, t, dt)
+    held, state = run("impose", step.impose, scene, state, t, dt)
     at, inside = run("stencil", step.stencil, scene.grid, scene.spline, state.position)
     state, finite, sums = run(
-        "stress and P2G", step._particles_to_grid, scene, state, at, inside, t, dt
+        "stress and P2G", step.particles_to_grid, scene, state, at, inside, t, dt
     )
-    grid_v = run("grid and walls", step._forces_and_boundaries, scene, at, sums, t, dt)
-    run("G2P and update", step._grid_to_particles, scene, state, at, finite, held, grid_v, dt)
+    grid_v = run("grid and walls", _on_grid, scene, at, sums, t, dt)
+    run("G2P and update", step.grid_to_particles, scene, state, at, finite, held, grid_v, dt)
+
+
+def _on_grid(scene: Any, at: Any, sums: Any, t: Any, dt: Any) -> Any:
+    region = step.region_of(scene.grid, at)
+    return step.forces_and_boundaries(scene, region, sums, t, dt)
 
 
 def measure(case: Case, variant: str, repeats: int) -> dict[str, float]:

@@ -6,8 +6,8 @@
 
 namespace {
 
-ffi::Error Send(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::int64_t law, Mask alive,
-                Mask inside, In xi, In position, In mass, In volume, In v, In C, In He, In H, In mu,
+ffi::Error Send(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::int64_t law, bool whole,
+                Mask alive, Mask inside, In xi, In position, In mass, In volume, In v, In C, In He, In H, In mu,
                 In lam, In numbers, Out g, MaskOut still_alive, MaskOut finite,
                 ffi::Result<ffi::Buffer<ffi::S32>> events) {
   Pool pool = pool_of(threads);
@@ -16,7 +16,7 @@ ffi::Error Send(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::int
   const Sent<T> out{each(g, D + 1), each(still_alive, 1), each(finite, 1), each(events, 1)};
   return with_kind(degree, mls, [&](auto K, auto Mls) {
     const auto run = [&](auto kind) {
-      send<T, D, K, Mls, decltype(kind)>(shape, batch_size(*g, D + 1), in, out, pool);
+      send<T, D, K, Mls, decltype(kind)>(shape, batch_size(*g, D + 1), whole, in, out, pool);
     };
     if (law == 0) run(NeoHookean<T>());
     if (law == 1) run(FixedCorotated<T>());
@@ -25,21 +25,21 @@ ffi::Error Send(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::int
 }
 
 ffi::Error Velocities(ffi::ThreadPool threads, std::int64_t contact, Sides x, Sides y, Sides z,
-                      In momentum_and_mass, In numbers, In friction, Out v_and_mass) {
+                      Bounds box, In momentum_and_mass, In numbers, In friction, Out v_and_mass) {
   Pool pool = pool_of(threads);
   velocities<T, D>(nodes_of(*v_and_mass).data(), batch_size(*v_and_mass, D + 1),
-                   walls_of(contact, x, y, z), shared_or_each(momentum_and_mass, D + 1),
+                   walls_of(contact, x, y, z, box), shared_or_each(momentum_and_mass, D + 1),
                    shared_or_each(numbers, 1), shared_or_each(friction, 1), each(v_and_mass, D + 1),
                    pool);
   return ffi::Error::Success();
 }
 
 ffi::Error VelocitiesTangent(ffi::ThreadPool threads, std::int64_t contact, Sides x, Sides y, Sides z,
-                             In momentum_and_mass, In numbers, In friction, In dmomentum_and_mass,
+                             Bounds box, In momentum_and_mass, In numbers, In friction, In dmomentum_and_mass,
                              In dnumbers, In dfriction, Out dv_and_mass) {
   Pool pool = pool_of(threads);
   velocities_tangent<T, D>(nodes_of(*dv_and_mass).data(), batch_size(*dv_and_mass, D + 1),
-                           walls_of(contact, x, y, z), shared_or_each(momentum_and_mass, D + 1),
+                           walls_of(contact, x, y, z, box), shared_or_each(momentum_and_mass, D + 1),
                            shared_or_each(numbers, 1), shared_or_each(friction, 1),
                            shared_or_each(dmomentum_and_mass, D + 1), shared_or_each(dnumbers, 1),
                            shared_or_each(dfriction, 1), each(dv_and_mass, D + 1), pool);
@@ -69,7 +69,7 @@ ffi::Error Receive(ffi::ThreadPool threads, std::int64_t degree, bool mls, std::
 }  // namespace
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(pgjax_send, Send,
-                              PGJAX_CALL().Arg<Mask>().Arg<Mask>().Arg<In>().Arg<In>().Arg<In>()
+                              PGJAX_CALL().Attr<bool>("whole").Arg<Mask>().Arg<Mask>().Arg<In>().Arg<In>().Arg<In>()
                                   .Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>().Arg<In>()
                                   .Arg<In>().Arg<In>().PGJAX_RET.Ret<Mask>().Ret<Mask>()
                                   .Ret<ffi::Buffer<ffi::S32>>());

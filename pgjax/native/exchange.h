@@ -119,7 +119,8 @@ PGJAX_INLINE Coefficients<Vec<T>, D, !Mls> momentum_and_force(T mass, T h, T fac
 }
 
 template <class T, int D, int K, bool Mls, class Law>
-void send(const Shape<D>& shape, Index batch, const Sender<T>& in, const Sent<T>& out, Pool& pool) {
+void send(const Shape<D>& shape, Index batch, bool whole, const Sender<T>& in, const Sent<T>& out,
+          Pool& pool) {
   constexpr int kSize = kGroup<T>;
   const auto strides = shape.strides();
   for_each_member(batch, pool, [&](Index b, Pool& pool) {
@@ -128,7 +129,10 @@ void send(const Shape<D>& shape, Index batch, const Sender<T>& in, const Sent<T>
     const bool *alive = in.alive.at(b), *inside = in.inside.at(b);
     T* const nodes = out.g.at(b);
     bool *still_alive = out.alive.at(b), *all_finite = out.finite.at(b);
-    clear(nodes, shape.node_count() * kChannels * sizeof(T), pool);
+    if (whole)
+      clear(nodes, shape.node_count() * kChannels * sizeof(T), pool);
+    else
+      clear_box(shape, touched<T, D, K>(shape, xi), nodes, pool);
     // Of a particle whose stencil is not in the array, against what was promised.
     clear(still_alive, shape.particles, pool);
     clear(all_finite, shape.particles, pool);
@@ -185,10 +189,22 @@ void send(const Shape<D>& shape, Index batch, const Sender<T>& in, const Sent<T>
 enum Contact { kNone, kSticky, kSlip, kSeparating };
 
 // The walls of a box: for the nodes along each direction, -1 behind the lower, 1 behind the upper.
+// And the nodes that may have mass, the first and the end along each direction; no other is looked
+// at or written. Without these numbers all may.
 template <int D>
 struct Walls {
   Contact contact = kNone;
   Batched<const std::int8_t> side[D];
+  Batched<const std::int32_t> box;
+
+  Box<D> box_at(const Index nodes[D], Index b) const {
+    Box<D> all;
+    for (int i = 0; i < D; ++i) {
+      all.first[i] = box.data ? std::clamp<Index>(box.at(b)[i], 0, nodes[i]) : 0;
+      all.end[i] = box.data ? std::clamp<Index>(box.at(b)[D + i], all.first[i], nodes[i]) : nodes[i];
+    }
+    return all;
+  }
 };
 
 // What a wall across `axis` does to the velocity of a node (`contact.py`); `inward` is +-1.
@@ -206,25 +222,25 @@ PGJAX_INLINE void touch(Contact contact, T friction, int axis, T inward, T v[D])
   for (int i = 0; i < D; ++i) v[i] *= left > 0 ? left : 0;
 }
 
-// Calls `one(node, sides)` for all nodes of a grid of D directions, in chunks along the first two:
+// Calls `one(node, sides)` for all nodes of a box of the grid, in chunks along the first directions:
 // `sides` are those of the node, `node` its number. The chunk is the third argument.
 template <int D, class F>
 void for_each_node(const Index nodes[D], const Walls<D>& walls, Index b, Pool& pool, const F& one) {
-  Index row = nodes[D - 1], rows = 1;
-  for (int i = 0; i < D - 1; ++i) rows *= nodes[i];
   const bool bounded = walls.contact != kNone;
-  constexpr Index kRows = 64;
+  const Box<D> box = walls.box_at(nodes, b);
+  constexpr Index kRows = 64, last = D - 1;
+  const Index rows = box.rows();
   pool.run((rows + kRows - 1) / kRows, [&](Index chunk) {
     const Index end = std::min(rows, (chunk + 1) * kRows);
     for (Index r = chunk * kRows; r < end; ++r) {
+      Index place[D] = {};
+      const Index row = box.row(nodes, r, place);
       std::array<int, D> sides = {};
-      if (bounded) {
-        Index rest = r;
-        for (int i = D - 2; i >= 0; --i) sides[i] = walls.side[i].at(b)[rest % nodes[i]], rest /= nodes[i];
-      }
-      for (Index k = 0; k < row; ++k) {
-        if (bounded) sides[D - 1] = walls.side[D - 1].at(b)[k];
-        one(r * row + k, sides, chunk);
+      if (bounded)
+        for (int i = 0; i < last; ++i) sides[i] = walls.side[i].at(b)[place[i]];
+      for (Index k = box.first[last]; k < box.end[last]; ++k) {
+        if (bounded) sides[last] = walls.side[last].at(b)[k];
+        one(row * nodes[last] + k, sides, chunk);
       }
     }
   });

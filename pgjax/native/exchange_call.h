@@ -15,13 +15,15 @@ Index each_particle(In& parameter) {
 }
 
 using Sides = ffi::Buffer<ffi::S8>;
+using Bounds = ffi::Buffer<ffi::S32>;
 
-// One array of sides for each direction; without walls they are empty.
-Walls<D> walls_of(std::int64_t contact, Sides& x, Sides& y, Sides& z) {
+// One array of sides for each direction, empty without walls; the box, empty for the whole grid.
+Walls<D> walls_of(std::int64_t contact, Sides& x, Sides& y, Sides& z, Bounds& box) {
   Walls<D> walls;
   walls.contact = Contact(contact);
   Sides* const all[3] = {&x, &y, &z};
   for (int i = 0; i < D; ++i) walls.side[i] = shared_or_each(*all[i], 1);
+  if (box.element_count() > 0) walls.box = shared_or_each(box, 1);
   return walls;
 }
 
@@ -61,7 +63,7 @@ Receiver<T> receiver(Mask& alive, Mask& finite, Mask& held, In& xi, In& g, In& p
       .Attr<std::int64_t>("kind")
 #define PGJAX_WALLS()                                                                          \
   ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<std::int64_t>("contact").Arg<Sides>().Arg<Sides>() \
-      .Arg<Sides>()
+      .Arg<Sides>().Arg<Bounds>()
 #define PGJAX_RET Ret<ffi::Buffer<kType>>()
 // The floating operands of `sender` or `receiver`.
 #define PGJAX_FLOATS \

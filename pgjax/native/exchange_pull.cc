@@ -34,11 +34,11 @@ ffi::Error SendPull(ffi::ThreadPool threads, std::int64_t degree, bool mls, std:
 }
 
 ffi::Error VelocitiesPull(ffi::ThreadPool threads, std::int64_t contact, Sides x, Sides y, Sides z,
-                          In momentum_and_mass, In numbers, In friction, In bar,
+                          Bounds box, In momentum_and_mass, In numbers, In friction, In bar,
                           Out momentum_and_mass_bar, Out numbers_bar, Out friction_bar) {
   Pool pool = pool_of(threads);
   velocities_pull<T, D>(nodes_of(momentum_and_mass).data(), batch_size(*momentum_and_mass_bar, D + 1),
-                        walls_of(contact, x, y, z), shared_or_each(momentum_and_mass, D + 1),
+                        walls_of(contact, x, y, z, box), shared_or_each(momentum_and_mass, D + 1),
                         shared_or_each(numbers, 1), shared_or_each(friction, 1),
                         shared_or_each(bar, D + 1), each(momentum_and_mass_bar, D + 1),
                         each(numbers_bar, 1), each(friction_bar, 1), pool);

@@ -572,6 +572,61 @@ inline void clear(void* data, Index bytes, Pool& pool) {
   });
 }
 
+// The nodes from `first` to before `end` along each direction.
+template <int D>
+struct Box {
+  Index first[D], end[D];
+
+  Index rows() const {
+    Index n = 1;
+    for (int i = 0; i < D - 1; ++i) n *= end[i] - first[i];
+    return n;
+  }
+  // Where row r of the box is in the whole grid, counted in rows; its place along the directions.
+  Index row(const Index nodes[D], Index r, Index place[D]) const {
+    for (int i = D - 2; i >= 0; --i) {
+      const Index width = end[i] - first[i];
+      place[i] = first[i] + r % width, r /= width;
+    }
+    Index at = 0;
+    for (int i = 0; i < D - 1; ++i) at = at * nodes[i] + place[i];
+    return at;
+  }
+};
+
+// All nodes that the stencils of the particles touch; none where there are no particles.
+template <class T, int D, int K>
+Box<D> touched(const Shape<D>& shape, const T* xi) {
+  Box<D> box;
+  for (int i = 0; i < D; ++i) box.first[i] = shape.nodes[i], box.end[i] = 0;
+  for (Index p = 0; p < shape.particles; ++p) {
+    Index first[D] = {};
+    T offset[D] = {};
+    if (!locate<T, D, K>(shape, xi + p * D, first, offset)) continue;
+    for (int i = 0; i < D; ++i) {
+      box.first[i] = std::min(box.first[i], first[i]);
+      box.end[i] = std::max(box.end[i], first[i] + K);
+    }
+  }
+  for (int i = 0; i < D; ++i) box.first[i] = std::min(box.first[i], box.end[i]);
+  return box;
+}
+
+// Clears the nodes of a box.
+template <class T, int D>
+void clear_box(const Shape<D>& shape, const Box<D>& box, T* nodes, Pool& pool) {
+  constexpr Index kRows = 64;
+  const Index rows = box.rows(), last = D - 1;
+  const Index bytes = (box.end[last] - box.first[last]) * kChannels * sizeof(T);
+  pool.run((rows + kRows - 1) / kRows, [&](Index chunk) {
+    Index place[D] = {};
+    for (Index r = chunk * kRows; r < std::min(rows, (chunk + 1) * kRows); ++r) {
+      const Index row = box.row(shape.nodes, r, place);
+      std::memset(nodes + (row * shape.nodes[last] + box.first[last]) * kChannels, 0, bytes);
+    }
+  });
+}
+
 // Clears the nodes, then calls `one(b, p, offset, node)` for every particle that fits: its place in
 // the cell and the first node of its stencil. No two calls at a time share a node.
 template <class T, int D, int K, class F>

@@ -65,9 +65,11 @@ Numbers<T> run(const Arrays<T, D>& a, Pool pool) {
   const auto bools = [](std::vector<char>& x) {
     return Batched<bool>{reinterpret_cast<bool*>(x.data()), Index(x.size()) / kBatch};
   };
-  send<T, D, K, Mls, Law<T>>(a.shape, kBatch, sender,
-                             {made(g), bools(alive), bools(finite), {events.data(), kEvents}}, pool);
-  keep(g);
+  for (const bool whole : {true, false}) {
+    send<T, D, K, Mls, Law<T>>(a.shape, kBatch, whole, sender,
+                               {made(g), bools(alive), bools(finite), {events.data(), kEvents}}, pool);
+    keep(g);
+  }
   for (char x : alive) all.push_back(x);
   for (char x : finite) all.push_back(x);
   for (Count x : events) all.push_back(T(x));
@@ -92,6 +94,10 @@ Numbers<T> run(const Arrays<T, D>& a, Pool pool) {
   std::fill(sides.begin(), sides.begin() + 4, -1), std::fill(sides.begin() + 15, sides.end(), 1);
   for (auto& side : walls.side) side = {sides.data(), 0};
   Numbers<T> v(g.size()), friction = {T(0.4)}, numbers_bar(kBatch * 4), friction_bar(kBatch);
+  velocities<T, D>(a.shape.nodes, kBatch, walls, each(g), shared(a.numbers), shared(friction), made(v), pool);
+  keep(v);
+  const std::int32_t bounds[2 * 3] = {1, 2, 3, 5, 6, 7};
+  walls.box = {bounds, 0};
   velocities<T, D>(a.shape.nodes, kBatch, walls, each(g), shared(a.numbers), shared(friction), made(v), pool);
   keep(v);
   velocities_tangent<T, D>(a.shape.nodes, kBatch, walls, each(g), shared(a.numbers), shared(friction),
