@@ -124,6 +124,7 @@ def _of_view(
         frames=film.numbers.tolist(),
         sigma=case.noise,
         still=made.still if len(made.still) else None,
+        carry=made.carriage,
     )
 
 

@@ -1,7 +1,7 @@
 """What cameras see of a motion."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -39,7 +39,8 @@ class Pictures(AbstractObservation):
     """Pictures of the Gaussians that move with the particles, from one camera or many.
 
     Args:
-        gaussians: one per observed particle, undeformed, in the axes of `to_simulation`.
+        gaussians: one per observed particle, or as many as `carry` returns, undeformed, in the
+            axes of `to_simulation`.
         cameras: one `Camera`, or several of one size.
         data: `(frames, cameras, height, width)` for silhouettes (opacity, 0 to 1) and depth (m),
             with a last axis of 3 for rgb (0 to 1); the axis of cameras is left out with one
@@ -50,6 +51,8 @@ class Pictures(AbstractObservation):
         frames, weights, robust: as for `Positions`.
         sigma: standard deviation of a pixel's noise, in its unit.
         particles: which particles carry the Gaussians; all if None.
+        carry: from positions and deformation gradients of these particles to those of the
+            Gaussians, differentiable; a Gaussian moves as its particle if None.
         to_simulation: from the coordinates of the Gaussians and cameras to the simulation's.
         still: Gaussians that do not move, in the coordinates of the others.
         rule: of the compositing.
@@ -64,6 +67,7 @@ class Pictures(AbstractObservation):
     data: Array
     background: Array
     particles: Array | None
+    carry: Callable[[Array, Array], tuple[Array, Array]] | None
     to_simulation: Similarity | None
     still: Gaussians | None
     sigma: Array
@@ -82,6 +86,7 @@ class Pictures(AbstractObservation):
         frames: Sequence[int] | None = None,
         sigma: Any = 0.05,
         particles: Any = None,
+        carry: Callable[[Array, Array], tuple[Array, Array]] | None = None,
         to_simulation: Similarity | None = None,
         still: Gaussians | None = None,
         weights: Any = None,
@@ -100,6 +105,7 @@ class Pictures(AbstractObservation):
         self.background = as_float_array(background)
         self.frames = observed_frames(frames, self.data.shape[0])
         self.particles = None if particles is None else particle_numbers(particles, len(gaussians))
+        self.carry = carry
         self.to_simulation, self.still = to_simulation, still
         self.sigma = deviation_of(sigma, self.data.shape, "the unit of a pixel")
         self.weights = frame_weights(weights, self.frames)
@@ -123,6 +129,8 @@ class Pictures(AbstractObservation):
         x, F = state.x, state.F
         if self.particles is not None:
             x, F = x[self.particles], F[self.particles]
+        if self.carry is not None:
+            x, F = self.carry(x, F)
         if self.to_simulation is not None:
             x, F = self.to_simulation.inverse().apply(x), self.to_simulation.pull_back(F)
         moved = deform(self.gaussians, x, F)

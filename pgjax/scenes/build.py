@@ -13,8 +13,10 @@ from pgjax.result import NEVER
 from pgjax.scene import Scene, initial_state
 from pgjax.scenes.camera import CameraPart
 from pgjax.scenes.capture import body
+from pgjax.scenes.carriage import Carriage
 from pgjax.scenes.conditions import ParticlesPart
 from pgjax.scenes.crowd import Crowd, by_material
+from pgjax.scenes.merging import merged
 from pgjax.scenes.model import ModelPart
 from pgjax.scenes.reader import SceneError, naming
 from pgjax.scenes.replaced import fitted, with_capture
@@ -34,7 +36,8 @@ class Plan:
         name: of the scene.
         scene: what the simulator takes.
         state: where it starts.
-        moving: the simulated Gaussians in simulation coordinates, in the order of the particles.
+        moving: the simulated Gaussians in simulation coordinates: one for each particle, in their
+            order, or carried by them.
         still: the others; they are drawn, not simulated.
         to_simulation: from the coordinates of the (first) model to the simulation's.
         dt: time step, s.
@@ -46,6 +49,7 @@ class Plan:
         notes: what was found in the models and done to them, a line each.
         models: of the scene file.
         body: of which model each particle is, `(n,)`.
+        carriage: how the particles carry the Gaussians; None where each Gaussian is a particle.
     """
 
     name: str
@@ -63,6 +67,7 @@ class Plan:
     notes: tuple[str, ...] = ()
     models: tuple[ModelPart, ...] = ()
     body: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    carriage: Carriage | None = None
 
     def camera(self, frame: int) -> Camera:
         """The camera of a frame."""
@@ -95,6 +100,11 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         file, changes = fitted(file, everybody)
     crowd, counts = by_material(everybody, [part.takes for part in file.materials])
     still = concatenate([b.still for b in bodies])
+    carriage = None
+    with naming(f"{file.source} [grid]"):
+        if file.grid.particle_spacing is not None:
+            crowd, counts, carriage, note = merged(crowd, counts, file.grid)
+            changes = (*changes, note)
     with naming(file.source):
         scene = _scene(file, crowd, counts, still)
         v, C = crowd.velocities()
@@ -117,6 +127,7 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
         notes=(*(note for b in bodies for note in b.notes), *changes),
         models=file.models,
         body=crowd.body,
+        carriage=carriage,
     )
     _require_countable(made, file.source)
     # What is too far or too near for the numbers of the simulation is said now.

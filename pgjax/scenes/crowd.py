@@ -21,7 +21,9 @@ class Crowd:
     Attributes:
         models: the models of the scene file, m of them.
         bodies: what became of each.
-        gaussians: the particles as Gaussians in simulation coordinates, n of them.
+        gaussians: what is drawn of them, in simulation coordinates: one for each particle, in
+            their order, as long as none were merged or cut up (`merging`).
+        x: positions, m, `(n, 3)`.
         rows: which Gaussian of its model's file each is or comes from, `(n,)`.
         body: of which model each is, `(n,)`.
         volumes: rest volumes, m³, `(n,)`.
@@ -30,6 +32,7 @@ class Crowd:
     models: tuple[ModelPart, ...]
     bodies: tuple[Body, ...]
     gaussians: Gaussians
+    x: np.ndarray
     rows: np.ndarray
     body: np.ndarray
     volumes: np.ndarray
@@ -37,25 +40,23 @@ class Crowd:
     @classmethod
     def of(cls, models: tuple[ModelPart, ...], bodies: Sequence[Body]) -> "Crowd":
         """The particles of one model after the other."""
+        gaussians = concatenate([b.moving for b in bodies])
         return cls(
             models=models,
             bodies=tuple(bodies),
-            gaussians=concatenate([b.moving for b in bodies]),
+            gaussians=gaussians,
+            x=np.asarray(gaussians.means),
             rows=np.concatenate([b.rows for b in bodies]),
             body=np.repeat(np.arange(len(bodies)), [len(b.rows) for b in bodies]),
             volumes=np.concatenate([b.volumes for b in bodies]),
         )
 
-    @property
-    def x(self) -> np.ndarray:
-        """Positions, m, `(n, 3)`."""
-        return np.asarray(self.gaussians.means)
-
     def ordered(self, order: np.ndarray) -> "Crowd":
-        """The same particles in another order."""
+        """The same particles, a Gaussian each, in another order."""
         return dataclasses.replace(
             self,
             gaussians=self.gaussians[jnp.asarray(order)],
+            x=self.x[order],
             rows=self.rows[order],
             body=self.body[order],
             volumes=self.volumes[order],

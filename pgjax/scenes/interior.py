@@ -14,7 +14,7 @@ from pgjax.render import Gaussians, concatenate
 from pgjax.scenes.model import FillPart
 
 # Particles at half the spacing of the nodes: eight in a cell.
-_PER_NODE = 0.5
+PER_NODE = 0.5
 _OPACITY = 0.99
 # Colours of so many Gaussians are mixed: single ones, hidden under the surface, can have any.
 _NEIGHBOURS = 16
@@ -44,7 +44,7 @@ def filled(part: FillPart, surface: Gaussians, grid_spacing: float) -> Interior:
         surface.means,
         surface.covariances,
         surface.opacities,
-        spacing=_PER_NODE * grid_spacing if part.spacing is None else part.spacing,
+        spacing=PER_NODE * grid_spacing if part.spacing is None else part.spacing,
         seal=part.seal,
         seed=part.seed,
         max_particles=part.max_particles,

@@ -211,7 +211,7 @@ def fingerprint(plan: Plan) -> dict[str, str]:
         if field.name in ("scene", "view"):
             for inner in dataclasses.fields(value):
                 parts[f"{field.name}.{inner.name}"] = getattr(value, inner.name)
-        elif field.name not in _IRRELEVANT:
+        elif field.name not in _IRRELEVANT and value is not None:
             parts[field.name] = value
     versions = {name: metadata.version(name) for name in ("pgjax", "jax", "jaxlib")}
     settings = {"precision": plan.state.dtype.name, "platform": jax.devices()[0].platform}

@@ -257,6 +257,9 @@ def _nothing(state: State) -> None:
 def carried(plan: Plan, x: jax.Array, F: jax.Array) -> tuple[Gaussians, int]:
     """The moving Gaussians of a frame, deformed, and how many stretches were bounded."""
     F, beyond = bound_stretch(F, plan.view.max_stretch)
+    if plan.carriage is not None:
+        beyond = beyond[plan.carriage.parents[:, 0]]
+        x, F = plan.carriage(x, F)
     return deform(plan.moving, x, F), int(beyond.sum())
 
 

@@ -22,11 +22,15 @@ from pgjax.transfer import MLS, AbstractScheme, SplineGradient
 
 @dataclasses.dataclass(frozen=True)
 class GridPart:
-    """The box of the grid and the discretisation on it."""
+    """The box of the grid and the discretisation on it.
+
+    `particle_spacing` is in spacings of the grid; each Gaussian is a particle where it is None.
+    """
 
     lower: Triple
     upper: Triple
     spacing: float
+    particle_spacing: float | None
     periodic: tuple[bool, bool, bool]
     spline: BSpline
     scheme: AbstractScheme
@@ -76,6 +80,8 @@ class SceneFile:
     particle_conditions: tuple[ParticlesPart, ...]
 
 
+SPLINES = {"quadratic": BSpline(2), "cubic": BSpline(3)}
+SCHEMES: dict[str, AbstractScheme] = {"spline-gradient": SplineGradient(), "mls": MLS()}
 # What a quality may change.
 _VARIED = ("model", "grid", "time", "camera")
 
@@ -177,14 +183,15 @@ def _grid(t: Table) -> GridPart:
         lower=t.vector("lower"),
         upper=t.vector("upper"),
         spacing=t.number("spacing", above=0),
+        particle_spacing=t.number("particle_spacing", None, above=0),
         periodic=t.booleans("periodic", (False, False, False)),
-        spline=t.choice("spline", {"quadratic": BSpline(2), "cubic": BSpline(3)}, "quadratic"),
-        scheme=t.choice(
-            "scheme", {"spline-gradient": SplineGradient(), "mls": MLS()}, "spline-gradient"
-        ),
+        spline=t.choice("spline", SPLINES, "quadratic"),
+        scheme=t.choice("scheme", SCHEMES, "spline-gradient"),
     )
     if not all(a + 4 * grid.spacing <= b for a, b in zip(grid.lower, grid.upper, strict=True)):
         raise t.error("upper", f"be at least 4 spacings above `lower` = {list(grid.lower)}")
+    if grid.particle_spacing is not None and grid.particle_spacing > 1:
+        raise t.error("particle_spacing", "be at most 1 spacing of the grid")
     return grid
 
 
