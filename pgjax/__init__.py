@@ -1,5 +1,7 @@
 """pgjax: a differentiable Material Point Method simulator for scenes captured as Gaussians."""
 
+from typing import TYPE_CHECKING, Any
+
 from pgjax.grid import Grid as Grid
 from pgjax.ledger import Ledger as Ledger
 from pgjax.result import Condition as Condition
@@ -22,4 +24,16 @@ from pgjax.timestep import stable_dt as stable_dt
 from pgjax.transfer import MLS as MLS
 from pgjax.transfer import SplineGradient as SplineGradient
 
+if TYPE_CHECKING:
+    from pgjax.sweeps import sweep as sweep
+
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """`pgjax.sweep`, which takes as long to import as all the rest, at its first use."""
+    if name == "sweep":
+        from pgjax.sweeps import sweep
+
+        return sweep
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -37,6 +37,22 @@ class Unknown:
     label: str
 
 
+@dataclasses.dataclass(frozen=True)
+class Key:
+    """A key of which only its place is looked for.
+
+    Attributes:
+        key: of the scene file, as that of an `Unknown`.
+        label: what messages begin with.
+    """
+
+    key: str
+    label: str
+
+
+Named = Unknown | Key
+
+
 def unknown(t: Table) -> Unknown:
     """An unknown from its table."""
     key = t.text("key")
@@ -77,19 +93,7 @@ def place(unknown: Unknown, plan: Plan) -> Place:
     Raises:
         SceneError: the key names nothing that can be found, or has another shape.
     """
-    group, *rest = unknown.key.split(".")
-    finders = {"material": _of_material, "boundary": _of_boundary, "model": _of_model}
-    if group == "forces" and rest:
-        found = _of_scene(".".join(rest), unknown, plan)
-    elif group in finders and rest:
-        number = counted(rest[0])
-        names = rest if number is None else rest[1:]
-        if not names:
-            raise _wrong(unknown, "name a key of the table, as in `material.E`")
-        found = finders[group](number, names, unknown, plan)
-    else:
-        groups = (*finders, "forces")
-        raise _wrong(unknown, f"begin with {', '.join(groups)} and a dot{nearest(group, groups)}")
+    found = find(unknown, plan)
     if found.now.shape != unknown.parameter.shape:
         raise SceneError(
             f"{unknown.label}: `start` must have the shape {found.now.shape} of `{unknown.key}` in "
@@ -98,16 +102,36 @@ def place(unknown: Unknown, plan: Plan) -> Place:
     return found
 
 
+def find(unknown: Named, plan: Plan) -> Place:
+    """The place that a key names, whatever its shape.
+
+    Raises:
+        SceneError: the key names nothing that can be found.
+    """
+    group, *rest = unknown.key.split(".")
+    finders = {"material": _of_material, "boundary": _of_boundary, "model": _of_model}
+    if group == "forces" and rest:
+        return _of_scene(".".join(rest), unknown, plan)
+    if group in finders and rest:
+        number = counted(rest[0])
+        names = rest if number is None else rest[1:]
+        if not names:
+            raise _wrong(unknown, "name a key of the table, as in `material.E`")
+        return finders[group](number, names, unknown, plan)
+    groups = (*finders, "forces")
+    raise _wrong(unknown, f"begin with {', '.join(groups)} and a dot{nearest(group, groups)}")
+
+
 def counted(name: str) -> int | None:
     """The index, from 0, that a part of a key counts from 1; None if it is a name."""
     return int(name) - 1 if re.fullmatch(r"[0-9]{1,9}", name) else None
 
 
-def _wrong(unknown: Unknown, rule: str) -> SceneError:
+def _wrong(unknown: Named, rule: str) -> SceneError:
     return SceneError(f"{unknown.label}: `key` must {rule}, but is {unknown.key!r}.")
 
 
-def _chosen(items: Any, number: int | None, kind: str, unknown: Unknown) -> int:
+def _chosen(items: Any, number: int | None, kind: str, unknown: Named) -> int:
     """Which of several tables is meant."""
     if number is None and len(items) > 1:
         raise _wrong(unknown, f"say which of {len(items)} tables is meant, as in `{kind}.1.…`")
@@ -117,7 +141,7 @@ def _chosen(items: Any, number: int | None, kind: str, unknown: Unknown) -> int:
     return number
 
 
-def _of_material(number: int | None, names: list[str], unknown: Unknown, plan: Plan) -> Place:
+def _of_material(number: int | None, names: list[str], unknown: Named, plan: Plan) -> Place:
     index = _chosen(plan.scene.materials, number, "material", unknown)
     material = plan.scene.materials[index]
     inner = {"plasticity": "plasticity", "active": "active"}.get(names[0])
@@ -152,7 +176,7 @@ def _at(tree: Any, path: tuple[str, ...]) -> Any:
     return tree
 
 
-def _of_boundary(number: int | None, names: list[str], unknown: Unknown, plan: Plan) -> Place:
+def _of_boundary(number: int | None, names: list[str], unknown: Named, plan: Plan) -> Place:
     index = _chosen(plan.scene.boundaries, number, "boundary", unknown)
     wall = plan.scene.boundaries[index]
     friction = getattr(getattr(wall, "contact", None), "friction", None)
@@ -166,7 +190,7 @@ def _of_boundary(number: int | None, names: list[str], unknown: Unknown, plan: P
     return Place(friction, put)
 
 
-def _of_scene(name: str, unknown: Unknown, plan: Plan) -> Place:
+def _of_scene(name: str, unknown: Named, plan: Plan) -> Place:
     known = ("gravity", "grid_damping", "shear_damping")
     if name not in known:
         raise _wrong(unknown, f"end with one of {', '.join(known)}{nearest(name, known)}")
@@ -177,10 +201,10 @@ def _of_scene(name: str, unknown: Unknown, plan: Plan) -> Place:
     return Place(getattr(plan.scene, name), put)
 
 
-def _of_model(number: int | None, names: list[str], unknown: Unknown, plan: Plan) -> Place:
+def _of_model(number: int | None, names: list[str], unknown: Named, plan: Plan) -> Place:
     index = _chosen(plan.models, number, "model", unknown)
     model, mine = plan.models[index], plan.body == index
-    x = np.asarray(plan.moving.means, np.float64)
+    x = np.asarray(plan.state.x, np.float64)
     center = np.average(x[mine], axis=0, weights=np.asarray(plan.scene.volumes)[mine])
     if names == ["velocity"]:
         now = np.asarray(model.velocity)

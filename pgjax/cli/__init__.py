@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-from pgjax.cli import convert, fit, info, init, preview, run, view
+from pgjax.cli import convert, fit, info, init, preview, run, sweep, tune, view
 
-_COMMANDS = (init, preview, run, convert, view, fit, info)
+_COMMANDS = (init, preview, run, convert, view, fit, sweep, tune, info)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,461 @@
+"""Sweeps: the same as single runs, whatever the grouping; failures are rows; nothing is lost."""
+
+import csv
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scene_files import DROP, ball, write
+
+import pgjax
+from pgjax import boundary, cli, models, sampling
+from pgjax.render import save_image, save_ply
+from pgjax.render.media import load_image
+from pgjax.scenes import SceneError, plan, read_scene
+from pgjax.scenes.schema import TimePart
+from pgjax.sweeps import Table, sweep
+from pgjax.sweeps.keys import full_key, known_keys, varied
+from pgjax.sweeps.layout import laid_out
+from pgjax.sweeps.members import combined
+from pgjax.sweeps.mosaic import tiled
+from pgjax.sweeps.need import needs
+from pgjax.sweeps.study import study
+from pgjax.timestep import stable_dt, substeps_for
+
+GRID = pgjax.Grid((0, 0), (12, 10), 1 / 10)
+X, VOLUMES = sampling.block((0.4, 0.2), (0.8, 0.6), spacing=1 / 20)
+FLOOR = boundary.Box((-9, 0.15), (9, 9), boundary.Separating(0.3))
+FRAME = 0.02
+
+
+def build(values):
+    """A block thrown on the floor; to the right as fast as it is told."""
+    jelly = models.Material(models.NeoHookean(values["E"], values.get("nu", 0.3)))
+    scene = pgjax.Scene(GRID, jelly, VOLUMES, gravity=(0, -9.81), boundaries=[FLOOR])
+    aside = jnp.asarray(values.get("aside", 0.0))
+    v = jnp.stack([aside, -jnp.ones_like(aside)])
+    return scene, pgjax.initial_state(scene, X, v)
+
+
+def where(scene, start, trajectory):
+    del scene, start
+    return {"height": jnp.mean(trajectory.final.x[:, 1]), "x": trajectory.final.x}
+
+
+def swept(vary, **more):
+    given = {"frames": 4, "frame_dt": FRAME, "measure": where, "at_once": 3}
+    return sweep(build, vary, **(given | more))
+
+
+VARY = {"E": [1e4, 1e5], "nu": [0.1, 0.3, 0.5, 0.2]}
+
+
+@pytest.fixture(scope="module")
+def table():
+    """Eight members, of which two cannot be simulated, in groups of three."""
+    return swept(VARY)
+
+
+def test_each_member_is_the_run_alone(table):
+    assert table.shape == (2, 4)
+    assert len(table) == 8
+    for k in np.flatnonzero(table.ok):
+        scene, state = build({"E": table["E"][k], "nu": table["nu"][k]})
+        steps = int(table["substeps"][k])
+        alone = pgjax.simulate(scene, state, dt=FRAME / steps, frames=4, substeps=steps)
+        np.testing.assert_allclose(table["x"][k], alone.final.x, rtol=0, atol=_rounding())
+        np.testing.assert_allclose(table["dt"][k] * steps, FRAME, rtol=1e-12)
+        # Never longer than what the member alone would take.
+        assert steps >= substeps_for(FRAME, stable_dt(scene, state)) - 1
+    assert np.all(table.on_grid("nu") == VARY["nu"])
+    assert np.all(table.on_grid("E") == np.asarray(VARY["E"])[:, None])
+
+
+def _rounding():
+    return 1e-12 if jnp.zeros(()).dtype == jnp.float64 else 1e-5
+
+
+def test_a_member_that_cannot_be_simulated_is_a_row(table):
+    failed = table["nu"] == 0.5
+    assert np.array_equal(~table.ok, failed)
+    for k in np.flatnonzero(failed):
+        assert table["status"][k] == "failed"
+        assert "`nu` must be below 0.5, but is 0.5" in table["message"][k]
+        assert np.isnan(table["height"][k])
+        assert np.isnan(table["substeps"][k])
+    assert table.summary() == "8 members: 6 ok, 2 failed"
+    assert table.reasons() == [("Argument `nu` must be below 0.5, but is 0.5.", 2)]
+
+
+def test_the_grouping_does_not_matter_at_one_time_step(table):
+    dt = float(np.nanmin(table["dt"]))
+    vary = {"E": [1e4, 1e5], "nu": [0.1, 0.3]}
+    one, three, all_at_once = (swept(vary, dt=dt, at_once=n) for n in (1, 3, 4))
+    for other in (one, all_at_once):
+        assert np.array_equal(three["substeps"], other["substeps"])
+        np.testing.assert_allclose(three["x"], other["x"], rtol=0, atol=_rounding())
+
+
+def test_groups_have_members_of_like_needs():
+    members = combined({"E": [1e5, 1e3, 1e4, 3e5, 3e3]})
+    layout = _layout(members.values, at_once=2)
+    groups = [group.tolist() for group in layout.groups()]
+    assert groups == [[3, 0], [2, 4], [1]]
+    need = layout.need.substeps
+    # c ~ sqrt(E).
+    np.testing.assert_allclose(need[3] / need[1], np.sqrt(300), rtol=0.2)
+
+
+def _layout(vary, **more):
+    given = dict.fromkeys(("dt", "at_once", "memory", "devices"))
+    given |= {"frames": 2, "frame_dt": FRAME, "measure": where, "save": lambda state: state.x}
+    return laid_out(build, vary, **(given | {"fraction": 0.5, "allow_unstable": False} | more))
+
+
+def test_the_need_of_a_member_is_that_of_stable_dt():
+    members = combined([{"E": 1e4, "aside": 0.0}, {"E": 1e3, "aside": 30.0}])
+    found = needs(build, members, FRAME, dt=None, fraction=0.5, allow_unstable=False)
+    for k, steps in enumerate(found.substeps):
+        alone = substeps_for(FRAME, stable_dt(*build(members.some(k))))
+        assert abs(steps - alone) <= 1
+    # The second is limited by its speed.
+    assert found.substeps[1] > found.substeps[0]
+
+
+def test_members_that_fail_on_the_way_harm_nobody():
+    """One leaves the grid, one is too fast for the time step; the third is as it is alone."""
+    vary = [{"E": 1e4, "aside": a} for a in (0.0, 9.0, -25.0)]
+    found = swept(vary, dt=FRAME / 24)
+    assert list(found["status"]) == ["ok", "failed", "failed"]
+    assert "OUT_OF_DOMAIN" in found["message"][1]
+    assert "left the grid" in found["message"][1]
+    alone = swept(vary[:1], dt=FRAME / 24, at_once=1)
+    np.testing.assert_allclose(found["x"][0], alone["x"][0], rtol=0, atol=_rounding())
+
+
+def test_a_step_above_the_bound_is_an_error_of_its_member():
+    vary, dt = {"E": [1e4, 1e6]}, FRAME / 8
+    found = swept(vary, dt=dt, frames=1)
+    assert list(found["status"]) == ["ok", "failed"]
+    assert "`dt` must be at most" in found["message"][1]
+    assert "but is 0.0025 s" in found["message"][1]
+    both = swept(vary, dt=dt, frames=1, allow_unstable=True)
+    assert both["status"][1] != "ok"
+    assert "DT_ABOVE_BOUND" in both["message"][1]
+
+
+def test_an_interrupted_sweep_goes_on(table, tmp_path):
+    class Enough(Exception):
+        pass
+
+    kept = []
+
+    def keep(member, arrays):
+        kept.append(member)
+        np.save(tmp_path / f"{member}.npy", arrays["x"])
+
+    def stop(done, members):
+        assert members == 6
+        if done == 3:
+            raise Enough
+
+    folder = tmp_path / "out"
+    with pytest.raises(Enough):
+        swept(VARY, folder=folder, keep=keep, progress=stop)
+    first = list(kept)
+    with pytest.raises(ValueError, match="holds an unfinished sweep, which goes on with `resume`"):
+        swept(VARY, folder=folder)
+    with pytest.raises(ValueError, match=r"these differ: `steps` .* `vary`"):
+        swept({"E": [1e4, 1e5], "nu": [0.1, 0.3, 0.5, 0.25]}, folder=folder, resume=True)
+    done = swept(VARY, folder=folder, keep=keep, resume=True, at_once=None)
+    # Nothing is run twice, and the result has the same bits.
+    assert sorted(kept) == np.flatnonzero(table.ok).tolist()
+    assert set(first).isdisjoint(kept[3:])
+    assert np.array_equal(done["height"], table["height"], equal_nan=True)
+    for member in kept:
+        assert np.array_equal(np.load(tmp_path / f"{member}.npy"), table["x"][member])
+    assert sorted(p.name for p in folder.iterdir()) == ["sweep.csv"]
+    with pytest.raises(ValueError, match="is finished"):
+        swept(VARY, folder=folder, resume=True)
+    with pytest.raises(ValueError, match="must be a new or an empty folder"):
+        swept(VARY, folder=folder)
+
+
+def test_the_table_on_disk_is_exact(table, tmp_path):
+    table.to_csv(tmp_path / "t.csv")
+    with (tmp_path / "t.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 8
+    for name in ("E", "nu", "height", "dt"):
+        values = np.asarray([float(row[name]) for row in rows], table[name].dtype)
+        assert np.array_equal(values, table[name], equal_nan=True)
+    assert rows[2]["message"] == "Argument `nu` must be below 0.5, but is 0.5."
+    assert rows[0]["substeps"] == str(int(table["substeps"][0]))
+    assert list(rows[0]) == list(table.columns)
+    assert table.rows[1]["E"] == 1e4
+    with pytest.raises(KeyError, match="There is no column 'hight', but E, nu, height"):
+        table["hight"]
+
+
+def test_vectors_have_a_column_for_each_number(tmp_path):
+    members = combined({"v": [(0, -1), (0, -2)], "E": [1e4]})
+    assert members.shape == (2, 1)
+    assert members.values["v"].shape == (2, 2)
+
+    def thrown(values):
+        scene, _ = build(values)
+        return scene, pgjax.initial_state(scene, X, values["v"])
+
+    found = sweep(thrown, {"v": [(0, -1), (0, -2)], "E": [1e4]}, frames=1, frame_dt=FRAME)
+    found.to_csv(tmp_path / "t.csv")
+    header, first, *_ = (tmp_path / "t.csv").read_text().splitlines()
+    assert header.startswith("v.x,v.y,E,mean_height,lowest,highest,extent_x,extent_y,largest_disp")
+    assert first.startswith("0,-1,10000,")
+    # What is thrown faster has more energy.
+    assert found["kinetic_energy"][1] > 2 * found["kinetic_energy"][0]
+    assert np.all(found["at_rest"] == 0)
+    assert np.all(found["plastic_part"] == 0)
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        ({}, "at least one parameter"),
+        ([], "at least one dict"),
+        ({"E": []}, "a sequence of finite numbers"),
+        ({"E": [1e4, float("nan")]}, "a sequence of finite numbers"),
+        ({"E": 1e4}, "a sequence of finite numbers"),
+        ({"E": ["stiff"]}, "a sequence of finite numbers"),
+        ([{"E": 1e4}, {"nu": 0.3}], "member 1 is"),
+        ("E", "a dict of values by name"),
+        ({name: range(2000) for name in "abc"}, "2000 x 2000 x 2000 values"),
+    ],
+)
+def test_what_is_varied_is_checked(vary, message):
+    with pytest.raises(ValueError, match=message):
+        combined(vary)
+
+
+def test_arguments_are_checked(tmp_path):
+    for more, message in (
+        ({"frames": 0}, "`frames` must be a whole number"),
+        ({"at_once": 0}, "`at_once` must be a whole number"),
+        ({"frame_dt": 0.0}, "`frame_dt` must be positive"),
+        ({"memory": -1.0}, "`memory` must be positive"),
+        ({"memory": 10.0, "at_once": None}, "`memory` must be at least"),
+        ({"share": (0, 2)}, "`folder` must be given"),
+        ({"share": (2, 2), "folder": tmp_path}, "0 ≤ i < n"),
+        ({"resume": True, "folder": tmp_path}, "holds none"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            swept({"E": [1e4]}, **more)
+
+
+def test_memory_bounds_the_groups():
+    vary = {"E": np.geomspace(1e4, 2e4, 12)}
+    one = _layout(vary).bytes_per_member
+    # Frames that are saved count.
+    assert one > 3 * X.size * jnp.zeros(()).dtype.itemsize
+    for fit in (1, 3):
+        assert _layout(vary, memory=(fit + 0.5) * one).lanes <= fit
+
+
+@pytest.mark.float64
+def test_two_processes_with_two_devices_each_do_the_same(tmp_path):
+    """Simulated devices, a group on each; the processes share a folder and end in any order."""
+    code = tmp_path / "shared.py"
+    code.write_text(SHARED)
+    environment = {
+        **os.environ,
+        "JAX_ENABLE_X64": "1",
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "PYTHONPATH": str(pathlib.Path(__file__).parent),
+    }
+    out = tmp_path / "out"
+    processes = [
+        subprocess.Popen(
+            [sys.executable, str(code), str(out), share],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        for share in "01"
+    ]
+    told = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], told
+    found = [json.loads(text.splitlines()[-1]) for text, _ in told]
+    assert [one["devices"] for one in found] == [2, 2]
+    # Who ends last has all of them, and has written the table.
+    assert min(one["pending"] for one in found) == 0
+    alone = swept(VARY, **ONE_BY_ONE)
+    with (out / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        heights = [float(row["height"]) for row in csv.DictReader(file)]
+    np.testing.assert_allclose(heights, alone["height"], rtol=0, atol=1e-12)
+
+
+ONE_BY_ONE = {"dt": FRAME / 8, "at_once": 1}
+SHARED = """
+import json, sys
+import jax
+from test_sweeps import ONE_BY_ONE, VARY, swept
+out, share = sys.argv[1:]
+table = swept(VARY, folder=out, share=(int(share), 2), **ONE_BY_ONE)
+print(json.dumps({"devices": len(jax.devices()), "pending": table.pending}))
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A scene file with two materials."""
+    folder = tmp_path_factory.mktemp("scene")
+    save_ply(folder / "drop.ply", ball())
+    return write(folder, DROP)
+
+
+@pytest.fixture(scope="module")
+def drop(scene):
+    return plan(read_scene(scene))
+
+
+def test_short_keys(drop):
+    for name, key in (
+        ("yield_stress", "material.2.plasticity.yield_stress"),
+        ("2.E", "material.2.E"),
+        ("material.1.nu", "material.1.nu"),
+        ("friction", "boundary.friction"),
+        ("boundary.1.friction", "boundary.1.friction"),
+        ("velocity", "model.velocity"),
+        ("gravity", "forces.gravity"),
+    ):
+        assert full_key(name, drop) == key
+    assert "material.2.density" in known_keys(drop)
+    # A wall without friction has none to vary.
+    assert not any(key.startswith("boundary.2") for key in known_keys(drop))
+
+
+def test_values(drop):
+    found = varied("friction=0:0.6:4", drop)
+    np.testing.assert_allclose(found.values, [0, 0.2, 0.4, 0.6])
+    np.testing.assert_allclose(varied("yield_stress=1e2:1e4:3:log", drop).values, [1e2, 1e3, 1e4])
+    np.testing.assert_allclose(varied("2.nu=.1,.3,.45", drop).values, [0.1, 0.3, 0.45])
+    velocities = varied("velocity=0,0,-1; 1,0,-2", drop).values
+    np.testing.assert_allclose(velocities, [[0, 0, -1], [1, 0, -2]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("E=1e4", "must say which of material.1.E, material.2.E is meant"),
+        ("yield_stres=1", r"must name one of .* \(did you mean `yield_stress`\?\)"),
+        ("material.1.nuu=1", "did you mean `nu`"),
+        ("walls.1.friction=1", "must begin with material"),
+        ("friction", "must be KEY=FIRST:LAST:COUNT"),
+        ("friction=", "must be KEY=FIRST:LAST:COUNT"),
+        ("friction=a", "could not convert string to float"),
+        ("friction=0.1,nan", "a value is not finite"),
+        ("friction=0:1", "a range has two ends and a count"),
+        ("friction=0:1:0", "the count is from 1"),
+        ("friction=0:1:3:log", "the ends of a logarithmic range are positive"),
+        ("velocity=1,2", "vectors of 3 numbers"),
+        ("velocity=1,2,3;4", "for a vector"),
+    ],
+)
+def test_bad_values(drop, text, message):
+    with pytest.raises(SceneError, match=message):
+        varied(text, drop)
+
+
+def test_values_out_of_their_range_are_errors_of_members(drop):
+    """Values are put into a scene that is built already: they are looked at all the same."""
+    texts = ["friction=-0.1,0.2", "2.density=0,500", "yield_stress=-1,100"]
+    made = study(drop, read_scene_time(), texts, trajectories=False)
+    need = made.layout(at_once=None, memory=None).need
+    assert np.flatnonzero(need.substeps).tolist() == [7]
+    assert "`friction` must be at least 0" in need.errors[3]
+    assert "`density` must be positive" in need.errors[5]
+    assert "`yield_stress` must be at least 0" in need.errors[6]
+    with pytest.raises(SceneError, match=r"once, but material\.2\.E is there twice"):
+        study(drop, read_scene_time(), ["2.E=1e4", "material.2.E=1e5"], trajectories=False)
+
+
+def read_scene_time():
+    return TimePart(frames=3, fps=25.0, dt=None, fraction=0.5, allow_unstable=False)
+
+
+def test_the_command(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["sweep", str(scene), "--vary", "2.E=2e4,4e4", "--vary", "2.nu=0.3,0.5"]
+    assert cli.main([*command, "--frames", "2", "--dry-run"]) == 0
+    told = capsys.readouterr().out
+    assert "4, of which 2 cannot be simulated" in told
+    assert "out/drop-sweep: sweep.csv, sweep.png, pictures/" in told
+    assert not (tmp_path / "out").exists()
+
+    assert cli.main([*command, "--frames", "2", "--save-trajectory"]) == 0
+    told = capsys.readouterr().out
+    assert "4 members: 2 ok, 2 failed" in told
+    assert "2 of them: Argument `nu` must be below 0.5, but is 0.5." in told
+    folder = tmp_path / "out" / "drop-sweep"
+    names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert names == {
+        "sweep.csv",
+        "sweep.png",
+        *(f"pictures/0000{i}.png" for i in (0, 2)),
+        *(f"trajectories/0000{i}.npz" for i in (0, 2)),
+    }
+    # The member with the scene's own values moves as the scene does.
+    with np.load(folder / "trajectories" / "00000.npz") as kept:
+        saved = dict(kept)
+    own = plan(read_scene(scene), frames=2)
+    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    steps = int(rows[0]["substeps"])
+    assert steps >= own.substeps
+    alone = pgjax.simulate(own.scene, own.state, dt=1 / own.fps / steps, frames=2, substeps=steps)
+    np.testing.assert_allclose(saved["x"], alone.saved.x, rtol=0, atol=_rounding())
+    np.testing.assert_allclose(saved["t"], [0, 0.04, 0.08], rtol=1e-5)
+    assert list(saved) == ["t", "x", "v", "F"]
+    assert load_image(folder / "pictures" / "00002.png").shape == (48, 64, 3)
+    assert load_image(folder / "sweep.png").shape[0] > 150
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--resume"], "`--out` must be given with `--resume`"),
+        (["--share", "3/2", "--out", "o"], "must be I/N with 1 ≤ I ≤ N, but is '3/2'"),
+        (["--frames", "0"], "`--frames` must be at least 1"),
+        (["--memory", "1e-6"], "`memory` must be at least"),
+        (["--out", "."], "must be a new or an empty folder"),
+    ],
+)
+def test_the_command_refuses(scene, tmp_path, monkeypatch, capsys, more, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").touch()
+    assert cli.main(["sweep", str(scene), "--vary", "2.E=2e4", *more]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_the_mosaic_has_a_place_for_each_member(tmp_path):
+    """Small pictures in their order; red frames and grey fields for those that failed."""
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for i in range(5):
+        save_image(pictures / f"{i:05d}.png", np.full((20, 30, 3), i / 8))
+    columns = {
+        "E": np.repeat([1.0, 2.0], 3),
+        "nu": np.tile([0.1, 0.2, 0.3], 2),
+        "status": np.asarray(["ok", "ok", "failed", "ok", "ok", "failed"]),
+    }
+    tiles = tiled(Table(columns, {}, ("E", "nu"), (2, 3)), pictures, 2, 3)
+    assert tiles.shape == (40, 90, 3)
+    centres = tiles[10::20, 15::30, 0]
+    np.testing.assert_allclose(centres[:, :2], [[0, 1 / 8], [3 / 8, 4 / 8]], atol=0.01)
+    np.testing.assert_allclose(centres[:, 2], [2 / 8, 0.85], atol=0.01)
+    assert tiles[0, 60, 0] > 2 * tiles[0, 60, 1]
