@@ -142,7 +142,7 @@ PLACES = [
     ("save_state", 3),
     ("write_json", 2),
     ("save_video", 1),
-    ("_advance", 6),
+    ("advance", 6),
 ]
 
 

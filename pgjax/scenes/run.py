@@ -225,14 +225,14 @@ def states(plan: Plan, state: State, frame: int) -> Iterator[tuple[int, State]]:
     """
     while True:
         goes_on = frame < plan.frames and bool(state.status.ok)
-        ahead = _advance(plan, state) if goes_on else None
+        ahead = advance(plan, state) if goes_on else None
         yield frame, state
         if ahead is None:
             return
         frame, state = frame + 1, ahead.final
 
 
-def _advance(plan: Plan, state: State) -> Trajectory:
+def advance(plan: Plan, state: State) -> Trajectory:
     """One frame; JAX computes it while the caller goes on."""
     with warnings.catch_warnings():
         # The plan says once how far the time step is from its bound.
@@ -256,11 +256,17 @@ def _nothing(state: State) -> None:
 
 def carried(plan: Plan, x: jax.Array, F: jax.Array) -> tuple[Gaussians, int]:
     """The moving Gaussians of a frame, deformed, and how many stretches were bounded."""
-    F, beyond = bound_stretch(F, plan.view.max_stretch)
-    if plan.carriage is not None:
-        beyond = beyond[plan.carriage.parents[:, 0]]
-        x, F = plan.carriage(x, F)
+    x, F, beyond = placed(plan, x, F)
     return deform(plan.moving, x, F), int(beyond.sum())
+
+
+def placed(plan: Plan, x: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Where the moving Gaussians are, with what they are deformed, and where that was bounded."""
+    F, beyond = bound_stretch(F, plan.view.max_stretch)
+    if plan.carriage is None:
+        return x, F, beyond
+    x, F = plan.carriage(x, F)
+    return x, F, beyond[plan.carriage.parents[:, 0]]
 
 
 @final
