@@ -43,7 +43,7 @@ def step(scene: Scene, state: State, dt: Float[Array, ""] | float) -> State:
     Returns:
         The state one step later. Differentiable in every array of `scene` and `state`.
     """
-    return followed_step(scene, state, dt, whole=not _leaves_nodes_out(scene)).after
+    return followed_step(scene, state, dt, whole=not leaves_nodes_out(scene)).after
 
 
 class Stages(NamedTuple):
@@ -82,7 +82,7 @@ def followed_step(
     return Stages(imposed, nodes, moved, after)
 
 
-def _leaves_nodes_out(scene: Scene) -> bool:
+def leaves_nodes_out(scene: Scene) -> bool:
     """Whether the passes keep to the nodes that have mass: in a grid that is mostly empty."""
     box, *others = scene.boundaries or (None,)
     walls = box is None or (isinstance(box, Box) and known(box.contact))

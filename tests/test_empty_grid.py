@@ -57,7 +57,7 @@ def whole_and_part(monkeypatch, run):
 def test_the_motion_is_the_same(monkeypatch, name, walls):
     scene, state = scene_of(MATERIALS[name], walls)
     dt = pgjax.stable_dt(scene, state)
-    assert steps._leaves_nodes_out(scene)
+    assert steps.leaves_nodes_out(scene)
 
     def run():
         return pgjax.simulate(scene, state, dt=dt, frames=2, substeps=20).saved

@@ -16,7 +16,7 @@ from pgjax.models import Material
 from pgjax.scene import Scene
 from pgjax.scenes.build import Plan
 from pgjax.state import State
-from pgjax.step import in_native_stages
+from pgjax.step import in_native_stages, leaves_nodes_out
 
 
 def summary(plan: Plan) -> str:
@@ -51,10 +51,39 @@ def facts(plan: Plan) -> list[tuple[str, str]]:
         ),
         (
             "computing",
-            f"{state_kind(plan)} on {jax.devices()[0].platform.upper()}, JAX {jax.__version__}",
+            f"{state_kind(plan)} on {jax.devices()[0].platform.upper()}, {_kernels(plan)}, JAX "
+            f"{jax.__version__}",
         ),
+        *(("left out", part) for part in _left_out(plan)),
         *(("note", note) for note in plan.notes),
     ]
+
+
+def _kernels(plan: Plan) -> str:
+    """What runs the steps."""
+    if not native.available():
+        return "plain JAX"
+    in_place = in_native_stages(plan.scene, plan.state)
+    return "native kernels" if in_place else "native transfers, laws in JAX"
+
+
+def _left_out(plan: Plan) -> list[str]:
+    """What this scene does not need, and so does not pay for; a line each."""
+    scene, parts = plan.scene, []
+    flowing = sum(
+        count
+        for material, count in zip(scene.materials, scene.counts, strict=True)
+        if material.plasticity is not None
+    )
+    if not flowing:
+        parts.append("no material flows: no return mapping, no total deformation, no history")
+    elif flowing < scene.particle_count:
+        parts.append(f"return mappings of {scene.particle_count - flowing} particles without one")
+    if len(plan.still):
+        parts.append(f"the simulation of {len(plan.still)} Gaussians that do not move")
+    if leaves_nodes_out(scene):
+        parts.append("nodes without mass: most of the grid is empty")
+    return parts
 
 
 def forecast(plan: Plan, folder: Path, *, ply_frames: bool, trajectory_frames: bool) -> str:
