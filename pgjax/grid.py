@@ -37,12 +37,17 @@ class Grid(eqx.Module):
         shape: number of cells along each direction, d = 2 or 3.
         h: spacing, m.
         periodic: which directions are periodic; by default none.
+
+    Attributes:
+        numbers: along each direction, which nodes of a larger grid these are, where it is a part
+            of one with the same origin; else None.
     """
 
     origin: Array
     shape: tuple[int, ...] = eqx.field(static=True)
     h: Array
     periodic: tuple[bool, ...] = eqx.field(static=True)
+    numbers: tuple[Int[Array, " _"] | None, ...] = eqx.field(init=False)
 
     def __init__(
         self,
@@ -59,6 +64,7 @@ class Grid(eqx.Module):
         self.periodic = as_tuple("periodic", periodic)
         require("periodic", self.periodic, "hold true or false", lambda a: (a == 0) | (a == 1))
         self.periodic = tuple(bool(np.all(p)) for p in self.periodic)
+        self.numbers = (None,) * len(self.shape)
 
     def __check_init__(self):
         d = len(self.shape)
@@ -108,9 +114,13 @@ class Grid(eqx.Module):
 
     def axes(self) -> list[Float[Array, " n"]]:
         """Positions of the distinct nodes along each direction relative to the origin, m."""
-        return [
-            (jnp.arange(m, dtype=self.h.dtype) - (0 if periodic else PAD)) * self.h
+        own = (
+            jnp.arange(m, dtype=self.h.dtype) - (0 if periodic else PAD)
             for m, periodic in zip(self.node_shape, self.periodic, strict=True)
+        )
+        return [
+            (given if numbers is None else numbers.astype(self.h.dtype)) * self.h
+            for given, numbers in zip(own, self.numbers, strict=True)
         ]
 
     def nodes(self) -> Float[Array, "*grid d"]:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Matrix3, Scalar, Vector3
+from pgjax.native import varying
 from pgjax.native.particles import per_particle
 
 # Cyclic Jacobi converges quadratically: errors after these are at rounding level.
@@ -78,9 +79,8 @@ def _eigenbasis(A: Matrix3) -> tuple[Vector3, Matrix3]:
     scale = jnp.max(jnp.abs(A))
     scale = jnp.where(scale > 0, scale, 1)
     # A loop, not unrolled: unrolled, XLA's fusion recomputes earlier sweeps many times over.
-    diagonalised, basis = jax.lax.fori_loop(
-        0, _sweeps(A.dtype), _jacobi_sweep, (A / scale, jnp.eye(3, dtype=A.dtype))
-    )
+    start = varying(A / scale, jnp.eye(3, dtype=A.dtype))
+    diagonalised, basis = jax.lax.fori_loop(0, _sweeps(A.dtype), _jacobi_sweep, start)
     w = [diagonalised[i, i] for i in range(3)]
     q = [[basis[i, j] for j in range(3)] for i in range(3)]
     for i, j in ((0, 1), (0, 2), (1, 2)):
@@ -200,7 +200,7 @@ def _svd(F: Matrix3) -> tuple[Matrix3, Vector3, Matrix3]:
     scale = jnp.where(scale > 0, scale, 1)
     A = F / scale
     # A loop, not unrolled: unrolled, XLA's fusion recomputes earlier sweeps many times over.
-    start = (A.T, jnp.eye(3, dtype=F.dtype), jnp.zeros(3, F.dtype))
+    start = varying(A.T, jnp.eye(3, dtype=F.dtype), jnp.zeros(3, F.dtype))
     G, V, lengths = jax.lax.fori_loop(0, _sweeps(F.dtype) + 1, _hestenes_sweep, start)
     g, v = ([[m[j, i] for i in range(3)] for j in range(3)] for m in (G, V))
     square = list(lengths)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from pgjax._across import total
 from pgjax._types import Array, Bool, Float, Matrix3, Scalar
 from pgjax.models.material import cast, particle_axes
 from pgjax.models.strain import principal_stretches
@@ -68,4 +69,6 @@ def _neighbours(scene: Scene, state: State) -> Float[Array, " p"]:
     cells = jax.vmap(cell)(position).astype(jnp.int32)
     index = tuple(cells[:, i] for i in range(len(shape)))
     counts = jnp.zeros(shape, state.dtype).at[index].add(state.alive.astype(state.dtype))
-    return counts[index]
+    # Who holds a part of the grid has all the particles of its cells.
+    is_part = any(numbers is not None for numbers in scene.grid.numbers)
+    return (counts if is_part else total(counts))[index]

@@ -23,9 +23,10 @@ class Condition(enum.IntEnum):
     DT_ABOVE_BOUND = 4
     ELLIPTICITY_LOST = 5
     F32_RESOLUTION = 6
+    OVERFLOW = 7
 
 
-ERRORS = (Condition.NONFINITE, Condition.OUT_OF_DOMAIN)
+ERRORS = (Condition.NONFINITE, Condition.OUT_OF_DOMAIN, Condition.OVERFLOW)
 
 _MEANING = {
     Condition.NONFINITE: (
@@ -55,6 +56,10 @@ _MEANING = {
     Condition.F32_RESOLUTION: (
         "single precision does not resolve {count} particle-frame(s) (more than 30 000 particles "
         "in a cell, or a ratio of stretches beyond 1e5). Use float64."
+    ),
+    Condition.OVERFLOW: (
+        "{count} particle(s) left their slab and could not go over to the next one, and were "
+        "masked. Give `Slabs` a larger `capacity`, a smaller `every` or a larger `margin`."
     ),
 }
 
@@ -122,7 +127,7 @@ class Status(eqx.Module):
         """Raise `SimulationError` for errors, warn for the rest; nothing while being traced.
 
         Raises:
-            SimulationError: a particle left the grid or became NaN.
+            SimulationError: a particle left the grid, became NaN or found no place on its device.
         """
         if concrete(self.count) is None or self.count.ndim != 1:
             return

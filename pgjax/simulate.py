@@ -4,7 +4,7 @@ import functools
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -125,16 +125,8 @@ def simulate(
         ValueError: an argument is out of range, or dt is above the stable bound at rest.
         SimulationError: a particle left the grid or became NaN (with `throw`).
     """
-    for name, value in (("frames", frames), ("substeps", substeps)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"Argument `{name}` must be a whole number ≥ 1, but is {value!r}.")
-    frames, substeps = int(frames), int(substeps)
-    require_kind("scene", scene, Scene)
-    require_kind("state", state, State)
-    _check_count(state, frames * substeps)
-    _check_particles(scene, state)
-    _check_dt(scene, dt, allow_unstable)
-    report = _meter(frames) if progress is True else progress or None
+    frames, substeps = check_arguments(scene, state, dt, frames, substeps, allow_unstable)
+    report = reporter(progress, frames)
     trajectory = _rollout(
         scene,
         state,
@@ -149,6 +141,26 @@ def simulate(
     if throw:
         trajectory.status.check()
     return trajectory
+
+
+def check_arguments(
+    scene: Scene,
+    state: State,
+    dt: float | Array,
+    frames: int | float,
+    substeps: int | float,
+    allow_unstable: bool,
+) -> tuple[int, int]:
+    """Refuse what `simulate` cannot run; the numbers of frames and substeps."""
+    for name, value in (("frames", frames), ("substeps", substeps)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"Argument `{name}` must be a whole number ≥ 1, but is {value!r}.")
+    require_kind("scene", scene, Scene)
+    require_kind("state", state, State)
+    _check_count(state, int(frames) * int(substeps))
+    _check_particles(scene, state)
+    _check_dt(scene, dt, allow_unstable)
+    return int(frames), int(substeps)
 
 
 def _check_count(state: State, steps: int) -> None:
@@ -194,7 +206,7 @@ def _check_dt(scene: Scene, dt: float | Array, allow_unstable: bool) -> None:
             f"The time step {float(value):.4g} s is {ratio:.2f} of the stable one at rest; moving "
             f"particles may become unstable. Recommended: {suggestion:.3g} s.",
             SimulationWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
@@ -210,10 +222,8 @@ def _rollout(
     keep_states: bool,
     ledger: bool,
 ) -> Trajectory:
-    """The nested scans. Frames are grouped, or divided, so that a block has about √T steps."""
-    root = math.sqrt(frames * substeps)
-    block = substeps if keep_states else math.ceil(root)
-    group = frames if keep_states else max(1, round(root / substeps))
+    """The nested scans of one device."""
+    plan = Blocks.of(frames, substeps, keep_states)
 
     def advance(carry: Carry) -> Carry:
         state, flows = carry
@@ -226,26 +236,66 @@ def _rollout(
         state, flows = carry
         return save(state), None if flows is None else balance(scene, state, flows, dt)
 
-    def frame(carry: Carry, index: Array) -> tuple[Carry, Any]:
-        state, flows = repeated(jax.checkpoint(lambda c: advance(c)), carry, substeps, block=block)
-        carry = note_frame(scene, state, dt), flows
+    def frame(carry: Carry) -> Carry:
+        advanced = jax.checkpoint(lambda c: advance(c))
+        state, flows = repeated(advanced, carry, substeps, block=plan.steps)
+        return note_frame(scene, state, dt), flows
+
+    start: Carry = note_start(scene, state, dt), Flows.none(state) if ledger else None
+    end, (saved, accounts) = over_frames(frame, kept, start, frames, plan, report)
+    t = times(state, dt, frames, substeps)
+    return Trajectory(saved, t, end[0], end[0].status, accounts)
+
+
+class Blocks(NamedTuple):
+    """How a rollout is checkpointed, about √T steps at a time.
+
+    Attributes:
+        steps: in a block of steps inside a frame.
+        frames: in a group; None where the blocks of steps bound the memory already.
+    """
+
+    steps: int
+    frames: int | None
+
+    @staticmethod
+    def of(frames: int, substeps: int, keep_states: bool) -> "Blocks":
+        """Frames are grouped, or divided, so that a block has about √T steps."""
+        root = math.sqrt(frames * substeps)
+        if keep_states:
+            return Blocks(substeps, frames)
+        steps = math.ceil(root)
+        return Blocks(steps, None if substeps > steps else max(1, round(root / substeps)))
+
+
+def over_frames(
+    frame: Callable[[Any], Any],
+    kept: Callable[[Any], Any],
+    start: Any,
+    frames: int,
+    blocks: Blocks,
+    report: Callable[[int, int], None] | None,
+) -> tuple[Any, Any]:
+    """Apply `frame` to what is carried; what is `kept` of the start and of every frame, stacked."""
+
+    def one(carry: Any, index: Array) -> tuple[Any, Any]:
+        carry = frame(carry)
         if report is not None:
             jax.debug.callback(functools.partial(_call, report), index, frames)
         # A function of its own: `save` may be a module that holds traced arrays.
         return carry, jax.checkpoint(lambda c: kept(c))(carry)
 
-    start: Carry = note_start(scene, state, dt), Flows.none(state) if ledger else None
     first = kept(start)
-    if substeps > block:
-        # The blocks of steps inside a frame bound its memory already.
-        end, rest = jax.lax.scan(frame, start, jnp.arange(frames, dtype=jnp.int32))
+    if blocks.frames is None:
+        end, rest = jax.lax.scan(one, start, jnp.arange(frames, dtype=jnp.int32))
     else:
-        end, rest = checkpointed_scan(frame, start, frames, group=group)
-    saved, accounts = jax.tree.map(
-        lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, rest
-    )
-    t = (state.step + substeps * jnp.arange(frames + 1, dtype=jnp.int32)).astype(dt.dtype) * dt
-    return Trajectory(saved, t, end[0], end[0].status, accounts)
+        end, rest = checkpointed_scan(one, start, frames, group=blocks.frames)
+    return end, jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, rest)
+
+
+def times(state: State, dt: Scalar, frames: int, substeps: int) -> Float[Array, " _"]:
+    """Times of the entries of a trajectory, s."""
+    return (state.step + substeps * jnp.arange(frames + 1, dtype=jnp.int32)).astype(dt.dtype) * dt
 
 
 def repeated(advance: Callable[[Any], Any], state: Any, count: int, *, block: int) -> Any:
@@ -290,6 +340,13 @@ def _even_group(count: int, group: int) -> int:
 
 def _call(report: Callable[[int, int], None], index: Any, frames: Any) -> None:
     report(int(index) + 1, int(frames))
+
+
+def reporter(
+    progress: bool | Callable[[int, int], None], frames: int
+) -> Callable[[int, int], None] | None:
+    """What is called after each frame."""
+    return _meter(frames) if progress is True else progress or None
 
 
 def _meter(frames: int) -> Callable[[int, int], None]:

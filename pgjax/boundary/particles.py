@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pgjax._across import total
 from pgjax._safe import safe_divide, safe_norm
 from pgjax._types import (
     Array,
@@ -285,8 +286,8 @@ def _overlap(t: Scalar, dt: Scalar, start: Array, end: Array) -> Scalar:
 
 def _pushed(particles: Particles, mask: Array, momentum: Float[Array, " d"]) -> Particles:
     """A momentum shared among the particles of a mask in proportion to mass."""
-    total = jnp.sum(jnp.where(mask, particles.mass, 0))
-    kick = safe_divide(momentum, jnp.broadcast_to(total, momentum.shape))
+    mass = total(jnp.sum(jnp.where(mask, particles.mass, 0)))
+    kick = safe_divide(momentum, jnp.broadcast_to(mass, momentum.shape))
     return particles._replace(v=jnp.where(mask[:, None], particles.v + kick[None, :], particles.v))
 
 

@@ -25,6 +25,7 @@ from pgjax.models.strain import (
     isochoric_strain,
     principal_stretches,
 )
+from pgjax.native import varying
 
 _ROOT_2_3 = (2 / 3) ** 0.5
 
@@ -199,7 +200,8 @@ def _herschel_bulkley_excess(
     zero, one = jnp.zeros_like(U), jnp.ones_like(U)
     # The root is below 1 and below 1/k.
     start = jnp.minimum(one, jnp.exp(-f_log_k)) / 2
-    _, _, z = jax.lax.fori_loop(0, 60, body, (zero, one, start))
+    bracket = varying(zero, one, start, f_log_k, f_h)[:3]
+    _, _, z = jax.lax.fori_loop(0, 60, body, bracket)
     z = jax.lax.stop_gradient(jnp.maximum(z, jnp.asarray(jnp.finfo(U.dtype).tiny, U.dtype)))
     z = z - residual(z, log_k, h) / jax.lax.stop_gradient(slope(z))
     return jnp.where(fluid & (excess > 0), U * z**h, 0)
