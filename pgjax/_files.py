@@ -72,6 +72,14 @@ def memory() -> float:
         return math.inf
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
 def is_file(path: Path) -> bool:
     """Whether there is an ordinary file, no pipe or device; what cannot be a path is none."""
     try:

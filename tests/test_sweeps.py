@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import pathlib
+import socket
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scene_files import DROP, ball, write
+from test_docs import run_blocks
 
 import pgjax
 from pgjax import boundary, cli, models, sampling
@@ -267,7 +269,10 @@ def test_memory_bounds_the_groups():
 
 @pytest.mark.float64
 def test_two_processes_with_two_devices_each_do_the_same(tmp_path):
-    """Simulated devices, a group on each; the processes share a folder and end in any order."""
+    """Simulated devices, a group on each; hosts of `jax.distributed` that share a folder."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
     code = tmp_path / "shared.py"
     code.write_text(SHARED)
     environment = {
@@ -279,13 +284,13 @@ def test_two_processes_with_two_devices_each_do_the_same(tmp_path):
     out = tmp_path / "out"
     processes = [
         subprocess.Popen(
-            [sys.executable, str(code), str(out), share],
+            [sys.executable, str(code), address, index, str(out)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env=environment,
         )
-        for share in "01"
+        for index in "01"
     ]
     told = [process.communicate() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], told
@@ -303,11 +308,37 @@ ONE_BY_ONE = {"dt": FRAME / 8, "at_once": 1}
 SHARED = """
 import json, sys
 import jax
+address, index, out = sys.argv[1:]
+jax.distributed.initialize(address, 2, int(index))
 from test_sweeps import ONE_BY_ONE, VARY, swept
-out, share = sys.argv[1:]
-table = swept(VARY, folder=out, share=(int(share), 2), **ONE_BY_ONE)
-print(json.dumps({"devices": len(jax.devices()), "pending": table.pending}))
+table = swept(VARY, folder=out, **ONE_BY_ONE)
+print(json.dumps({"devices": len(jax.local_devices()), "pending": table.pending}))
 """
+
+
+def test_the_page():
+    names = run_blocks(pathlib.Path(__file__).parent.parent / "docs" / "sweeps.md")
+    assert names["heights"].shape == (3, 4)
+    assert names["table"].ok.all()
+    # What yields more flows more, and ends lower.
+    assert np.all(np.diff(names["table"].on_grid("plastic_part"), axis=1) <= 0)
+    thrown = names["thrown"]
+    assert list(thrown.ok) == [True, True, False]
+    assert thrown["rebound"][0] > thrown["rebound"][1]
+    assert thrown["speeds"].shape == (3, 11)
+    assert "`E` must be positive" in thrown["message"][2]
+
+
+def test_shares_without_jax_distributed(table, tmp_path):
+    """One after the other, as jobs of an array: the last one writes the table."""
+    first = swept(VARY, folder=tmp_path / "out", share=(1, 2))
+    assert first.pending == 3
+    assert not (tmp_path / "out" / "sweep.csv").exists()
+    assert np.array_equal(first["height"][first.ok], table["height"][first.ok])
+    last = swept(VARY, folder=tmp_path / "out", share=(0, 2))
+    assert last.pending == 0
+    assert np.array_equal(last["height"], table["height"], equal_nan=True)
+    assert (tmp_path / "out" / "sweep.csv").exists()
 
 
 @pytest.fixture(scope="module")

@@ -98,11 +98,13 @@ def _use_all_cores() -> None:
     """A member on each core at a time: faster than all cores on each member."""
     import jax
 
+    from pgjax._files import cores
+
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     # Too late where JAX runs already: then it has the devices that it has.
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+        jax.config.update("jax_num_cpu_devices", cores())
 
 
 def _study(options: argparse.Namespace) -> "Study":

@@ -1,7 +1,6 @@
 """How many members are run at once: as the threads of a CPU want, and as memory allows."""
 
 import math
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from pgjax._files import cores
 from pgjax._files import memory as memory_of_machine
 from pgjax._types import Array
 from pgjax.scenes.summary import needed_memory
@@ -19,7 +19,7 @@ from pgjax.sweeps.program import Measure, Save, rollout
 # Of the memory of a machine or an accelerator, all members at a time take at most this part.
 _PART = {"cpu": 0.25, "gpu": 0.6, "tpu": 0.6}
 # Particles that a thread of a CPU has to do in each operation, so that starting it costs little.
-_PARTICLES_PER_THREAD = 8000
+_PARTICLES_PER_THREAD = 2000
 # Members for each thread of a CPU device that has several: they finish at different times.
 _MEMBERS_PER_THREAD = 4
 
@@ -49,7 +49,7 @@ def lanes_within(
             f"{memory:.3g}."
         )
     limit = _available(devices) if memory is None else memory
-    most = min(limit // one, members)
+    most = min(limit / one, members)
     if devices[0].platform == "cpu":
         most = min(most, _busy(particles, len(devices)))
     # As few calls as that takes, all of about the same size.
@@ -59,7 +59,7 @@ def lanes_within(
 
 def _busy(particles: int, devices: int) -> int:
     """Members that keep the threads of one of several CPU devices busy."""
-    threads = max(1, (os.cpu_count() or 1) // devices)
+    threads = max(1, cores() // devices)
     each = math.ceil(_PARTICLES_PER_THREAD / particles)
     return each if threads == 1 else each * _MEMBERS_PER_THREAD * threads
 

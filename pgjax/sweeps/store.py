@@ -1,17 +1,20 @@
 """What a sweep keeps on disk while it goes on: results so far, and what they are of."""
 
+import contextlib
 import dataclasses
 import json
+import os
 import shutil
+import uuid
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from pgjax._files import read_text
-from pgjax.storage import digest, durably_replacing, save_arrays
+from pgjax.storage import digest, flush, save_arrays
 from pgjax.sweeps.layout import Layout
 from pgjax.sweeps.program import Task
 from pgjax.sweeps.results import Results
@@ -80,15 +83,23 @@ def open_store(
     if not path.is_file():
         _require_empty(folder, shared)
         path.parent.mkdir(parents=True, exist_ok=shared)
-        record = {"version": _VERSION, "lanes": lanes, "of": dict(marks)}
-        with durably_replacing(path) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        _create(path, {"version": _VERSION, "lanes": lanes, "of": dict(marks)})
     elif not resume and not shared:
         raise ValueError(
             f"Argument `folder` must be a new or an empty folder, so that nothing is overwritten, "
             f"but {folder} holds an unfinished sweep, which goes on with `resume`."
         )
     return Store(folder, _checked(path, marks))
+
+
+def _create(path: Path, record: Mapping[str, Any]) -> None:
+    """Write the record, unless another process has just done so."""
+    temporary = path.with_name(f".{uuid.uuid4().hex}.json")
+    temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    flush(temporary)
+    with contextlib.suppress(FileExistsError):
+        os.link(temporary, path)
+    temporary.unlink()
 
 
 def _require_empty(folder: Path, shared: bool) -> None:

@@ -120,9 +120,13 @@ def perform(
         return tabulated(layout.members, layout.need, [])
     store = None
     if folder is not None:
+        marks = fingerprint(layout, task)
+        if share is not None:
+            # All have to make the same groups, whatever memory or threads they have.
+            marks["at_once"] = str(layout.lanes)
         store = open_store(
             Path(folder),
-            fingerprint(layout, task),
+            marks,
             layout.lanes,
             resume=resume,
             shared=share is not None,
