@@ -127,7 +127,7 @@ def _foretell(file: "SceneFile", frames: int, target: Path) -> None:
     from pgjax.scenes.trial import prepared
     from pgjax.scenes.tune import choices, ladder
 
-    rungs = list(ladder(own(file)))
+    rungs = ladder(file)
     runs = [("always", "its own", own(file)), *(("always", *rung) for rung in rungs[:3])]
     runs += [("once", what, s) for group in choices(rungs[1][1]) for what, s in group]
     runs += [("if needed", *rung) for rung in rungs[3:5]]

@@ -1,6 +1,7 @@
 """Values of a scene file are changed in its text; comments and all else stay as they are."""
 
 import copy
+import itertools
 import re
 import tomllib
 from collections.abc import Mapping
@@ -77,8 +78,8 @@ def _put(lines: list[str], place: Place, value: Any) -> None:
 def _sections(lines: list[str], name: str) -> list[tuple[int, int]]:
     """First and last + 1 line of the content of every table of a name."""
     heads = [(i, m[1]) for i, line in enumerate(lines) if (m := _HEADER.match(line))]
-    ends = [i for i, _ in heads[1:]] + [len(lines)]
-    return [(i + 1, end) for (i, head), end in zip(heads, ends, strict=True) if head == name]
+    heads.append((len(lines), ""))
+    return [(i + 1, end) for (i, head), (end, _) in itertools.pairwise(heads) if head == name]
 
 
 def _in_table(lines: list[str], start: int, end: int, key: str, value: Any) -> None:

@@ -7,6 +7,8 @@ import numpy as np
 
 # Orders that a scheme of second order can have; what is observed beyond them is not believed.
 _LOWEST, _HIGHEST = 0.5, 2.0
+# What is left in doubt of an extrapolation at least.
+_SAFETY = 0.25
 # Changes from level to level that have less in common do not approach anything.
 _COHERENT = 0.5
 
@@ -56,9 +58,10 @@ def refined(levels: Sequence[np.ndarray], ratio: float) -> Limit:
     """The limit of motions on finer and finer grids, from the last three.
 
     With the changes `Δ₁ = x₁ − x₀`, `Δ₂ = x₂ − x₁` and `q = |Δ₂|/|Δ₁| = ratio^(−p)`, the order p
-    bounded to between 1/2 and 2, it is `x₂ + Δ₂ q/(1 − q)`, and in doubt by
-    `|Δ₂ − q Δ₁| q/(1 − q)`: what the changes do not have in common. Where they do not approach
-    anything the limit is x₂, in doubt by `|Δ₂| q/(1 − q)`.
+    bounded to between 1/2 and 2, it is `x₂ + e` with `e = Δ₂ q/(1 − q)`. It is in doubt by
+    `|Δ₂ − q Δ₁| q/(1 − q)`, what the changes do not have in common, but at least by a quarter of e
+    (after P. J. Roache's grid convergence index, 1994), and by all of it where the order is below
+    1/2. Where the changes do not approach anything the limit is x₂, in doubt by `|Δ₂| q/(1 − q)`.
 
     Args:
         levels: at least three motions `(f, n, 3)`, coarse to fine, of the same Gaussians.
@@ -76,7 +79,8 @@ def refined(levels: Sequence[np.ndarray], ratio: float) -> Limit:
     coherence = float(np.sum(first * second)) / norms if norms > 0 else 0.0
     ahead = q / (1 - q)
     if order > 0 and coherence > _COHERENT:
-        x, doubt = x2 + ahead * second, ahead * largest(second - q * first)
+        least = (_SAFETY if order >= _LOWEST else 1.0) * d2
+        x, doubt = x2 + ahead * second, ahead * max(largest(second - q * first), least)
     else:
         x, doubt = x2, ahead * d2
     changes = (d1 / size, d2 / size)

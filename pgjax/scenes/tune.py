@@ -9,7 +9,10 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from pgjax.scenes.refinement import Limit, refined, scale
+from pgjax.scenes.schema import SceneFile
 from pgjax.scenes.settings import Setting, own
 from pgjax.scenes.trial import Trial, Trials
 from pgjax.splines import BSpline
@@ -21,6 +24,8 @@ RATIO = 2**0.5
 _FIRST, _FINEST, _COARSEST = -2, 4, -4
 # Particles at half a spacing: eight in a cell. Others, in spacings; other time steps.
 _EIGHT, _OTHERS, _FRACTIONS = 0.5, (0.4, 2 / 3), (0.25, 0.9)
+# Cells along each side of the box of a grid, at least.
+_CELLS = 8
 # Time goes with this power of 1/spacing: a solid in space, and its time step.
 _POWER = 4
 # The rung on which choices are tried alone may be so many times above the error asked for.
@@ -100,12 +105,21 @@ def on_rung(base: Setting, rung: int) -> Setting:
     return dataclasses.replace(base, spacing=spacing, particle_spacing=_EIGHT)
 
 
-def ladder(base: Setting) -> Iterator[tuple[str, Setting]]:
+def ladder(file: SceneFile) -> list[tuple[str, Setting]]:
     """The rungs from coarse to fine; the first three are always run."""
     # A time step that was given is one for the grid it was given for.
-    base = dataclasses.replace(base, dt=None)
-    for rung in range(_FIRST, _FINEST + 1):
-        yield f"grid {RATIO**-rung:.3g} times as coarse", on_rung(base, rung)
+    base = dataclasses.replace(own(file), dt=None)
+    rungs = [
+        (f"grid {RATIO**-rung:.3g} times as coarse", on_rung(base, rung))
+        for rung in range(_FIRST, _FINEST + 1)
+    ]
+    return [(what, setting) for what, setting in rungs if _fits(file, setting.spacing)]
+
+
+def _fits(file: SceneFile, spacing: float) -> bool:
+    """Whether the box of the grid has enough cells of a spacing."""
+    sides = np.asarray(file.grid.upper) - np.asarray(file.grid.lower)
+    return bool(np.all(sides >= _CELLS * spacing))
 
 
 def choices(base: Setting) -> list[list[tuple[str, Setting]]]:
@@ -127,7 +141,7 @@ def choices(base: Setting) -> list[list[tuple[str, Setting]]]:
 def _climb(trials: Trials, asked: float) -> Limit | None:
     """Run finer and finer grids until one of them is good enough."""
     levels, limit = [], None
-    for what, setting in ladder(own(trials.file)):
+    for what, setting in ladder(trials.file):
         trial = trials.run(what, setting)
         if trial is None:
             break
@@ -203,6 +217,8 @@ def _walk(
         if rung in tried:
             return
         spacing = float(f"{start / RATIO**rung:.4g}")
+        if not _fits(trials.file, spacing):
+            return
         trial = trials.run("together", dataclasses.replace(merged, spacing=spacing))
         if trial is None:
             return
