@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pgjax._across import AXIS
 from pgjax._types import Array, Scalar, as_tuple, require_kind
@@ -174,8 +174,13 @@ def _rollout(
         parts = repeated(advanced, parts, substeps, block=blocks.steps)
         return device.noted(note_frame, parts)
 
+    def collected(parts: Parts) -> State:
+        """Whole on every device, so that every process can look at it."""
+        everywhere = NamedSharding(mesh, _WHOLE)
+        return jax.lax.with_sharding_constraint(collect(parts, state, plan.places), everywhere)
+
     def kept(parts: Parts) -> tuple[Any, Ledger | None]:
-        whole = collect(parts, state, plan.places)
+        whole = collected(parts)
         if parts.flows is None:
             return save(whole), None
         flows = jax.tree.map(lambda a: jnp.sum(a, axis=0), parts.flows)
@@ -187,7 +192,7 @@ def _rollout(
     end, (saved, accounts) = over_frames(
         lambda parts: on_devices(frame, parts), kept, start, frames, blocks, report
     )
-    final = collect(end, state, plan.places)
+    final = collected(end)
     return Trajectory(saved, times(state, dt, frames, substeps), final, final.status, accounts)
 
 
