@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scene_files import CAMERA, GRID, JELLY, MODEL, TWO_MATERIALS, ball, planned
 
-from pgjax.render import load_ply, save_ply
+from pgjax.inverse import Pictures
+from pgjax.inverse.pictures import SMOOTH
+from pgjax.render import load_ply, render, save_ply
 from pgjax.scenes import SceneError, run
 from pgjax.scenes.carriage import Carriage
 from pgjax.scenes.record import fingerprint
@@ -271,3 +273,14 @@ def test_a_scene_is_resumed_with_its_own_particles_only(tmp_path):
     other = planned(tmp_path, MODEL, spaced(0.09), JELLY)
     assert "carriage" not in fingerprint(own)
     assert "carriage" in fingerprint(other)
+
+
+def test_pictures_of_what_is_carried(tmp_path):
+    """Identification from pictures sees the Gaussians where the particles carry them."""
+    p = planned(tmp_path, FLYING, spaced(0.09), JELLY, CAMERA)
+    x = p.state.x + jnp.asarray([0.1, 0, 0], p.state.x.dtype)[None]
+    state = dataclasses.replace(p.state, position=x - p.state.origin[None])
+    camera, blank = p.camera(0), np.zeros((1, 48, 64, 3))
+    seen = Pictures(p.moving, camera, blank, carry=p.carriage).see(state)
+    there = dataclasses.replace(p.moving, means=p.moving.means + jnp.asarray([[0.1, 0, 0]]))
+    np.testing.assert_allclose(seen, render(there, camera, rule=SMOOTH).rgb, atol=2e-3)

@@ -321,15 +321,30 @@ def test_a_preset_becomes_a_file_here(tmp_path, monkeypatch, capsys):
     assert "not there yet" in capsys.readouterr().err
 
 
+def test_what_is_best_already_is_not_written(tmp_path, monkeypatch, capsys, file):
+    def law(setting):
+        error, seconds = first_order(setting)
+        return error, 1e-3 if setting == own(file) else seconds
+
+    pretended(monkeypatch, law)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["tune", "drop.toml", "--error", "5%"]) == 0
+    assert "nothing is written" in capsys.readouterr().out
+    assert (tmp_path / "drop.toml").read_text() == FINE
+    assert not (tmp_path / "drop.before-tune.toml").exists()
+
+
 def test_what_would_be_run_is_said(tmp_path, monkeypatch, capsys, file):
     assert file
     monkeypatch.chdir(tmp_path)
+    coarse = changed(DROP, ("spacing = 0.1", "spacing = 0.06"))
+    (tmp_path / "drop.toml").write_text(coarse)
     assert cli.main(["tune", "drop.toml", "--dry-run"]) == 0
     told = capsys.readouterr().out
     assert told.count("always") == 4
     assert "cubic" in told
     assert "writes     drop.toml" in told
-    assert (tmp_path / "drop.toml").read_text() == FINE
+    assert (tmp_path / "drop.toml").read_text() == coarse
 
 
 @pytest.mark.slow

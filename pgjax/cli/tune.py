@@ -174,15 +174,19 @@ def _write(file: "SceneFile", path: Path, target: Path, chosen: "Row") -> int:
     from pgjax.scenes.edit import LONGEST, edited
     from pgjax.scenes.settings import changes
 
-    text = edited(read_text(path, LONGEST), changes(file, chosen.trial.setting), path.name)
+    new = changes(file, chosen.trial.setting)
+    if not new:
+        print("           which is its own: nothing is written")
+        return 0
+    text = edited(read_text(path, LONGEST), new, path.name)
     if target == path:
         shutil.copyfile(path, _kept(path))
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
         print(f"kept       {_kept(path)}")
     else:
-        with target.open("x", encoding="utf-8") as new:
-            new.write(text)
+        with target.open("x", encoding="utf-8") as copy:
+            copy.write(text)
     print(f"wrote      {target}")
     print(f"next       pgjax run {shlex.quote(str(target))}")
     return 0

@@ -9,6 +9,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+import jax.numpy as jnp
 import numpy as np
 
 from pgjax.scenes.refinement import Limit, refined, scale
@@ -168,7 +169,8 @@ def _combine(trials: Trials, limit: Limit, asked: float) -> None:
     """Try every other choice alone, and then those that pay together."""
     base = _rough(trials, limit, asked)
     order = min(max(limit.order, 0.5), 2.0)
-    trials.run("double precision", base.trial.setting, double=True)
+    if jnp.zeros(()).dtype == jnp.float32:
+        trials.run("double precision", base.trial.setting, double=True)
     merged, expected = base.trial.setting, base.error
     for alternatives in choices(base.trial.setting):
         tried = [(s, trials.run(what, s)) for what, s in alternatives]
