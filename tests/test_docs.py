@@ -31,6 +31,21 @@ def test_readme():
 
 
 @pytest.mark.float64
+def test_quick_start():
+    names = run_blocks(ROOT / "docs" / "quick-start.md")
+    assert names["softer"] != names["stiffer"]
+    ahead, behind = (names["height"](1e4 + step) for step in (1.0, -1.0))
+    np.testing.assert_allclose(names["slope"], (ahead - behind) / 2, rtol=1e-3)
+
+
+@pytest.mark.float64
+def test_gradients_and_memory():
+    names = run_blocks(ROOT / "docs" / "gradients-and-memory.md")
+    np.testing.assert_allclose(names["along"], names["by_E"], rtol=1e-10)
+    assert names["by_every_velocity"].shape == names["state"].v.shape
+
+
+@pytest.mark.float64
 def test_extend():
     names = run_blocks(ROOT / "docs" / "extend.md")
     assert all(jnp.isfinite(slope) for slope in names["slopes"])
