@@ -316,6 +316,15 @@ print(json.dumps({"devices": len(jax.local_devices()), "pending": table.pending}
 """
 
 
+def test_a_sweep_of_which_nothing_can_be_simulated_has_its_table(tmp_path):
+    found = swept({"E": [-1.0, 0.0]}, folder=tmp_path / "out")
+    assert not found.ok.any()
+    first, second = found["message"]
+    assert "`E` must be positive and finite (Pa), but is -1.0" in first
+    assert "but is 0.0" in second
+    assert len((tmp_path / "out" / "sweep.csv").read_text().splitlines()) == 3
+
+
 def test_the_page():
     names = run_blocks(pathlib.Path(__file__).parent.parent / "docs" / "sweeps.md")
     assert names["heights"].shape == (3, 4)

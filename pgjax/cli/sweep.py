@@ -71,7 +71,7 @@ def _sweep(options: argparse.Namespace) -> int:
     # Imported here: `pgjax --help` and errors in the arguments should not wait for JAX.
     from pgjax.scenes.record import require_empty
 
-    if folder is not None and not options.resume and not share:
+    if folder is not None and not (options.resume or share or (folder / "parts").is_dir()):
         require_empty(folder)
     _use_all_cores()
     study = _study(options)
@@ -141,7 +141,7 @@ def _run(
                 resume=options.resume,
                 share=share,
             )
-    except (KeyboardInterrupt, OSError) as error:
+    except (KeyboardInterrupt, OSError, RuntimeError) as error:
         if not (folder / "parts").is_dir():
             raise
         was_stopped = isinstance(error, KeyboardInterrupt)

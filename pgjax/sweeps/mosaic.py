@@ -44,16 +44,18 @@ def save_mosaic(path: Path, table: Table, pictures: Path) -> None:
 
 def tiled(table: Table, pictures: Path, rows: int, columns: int) -> np.ndarray:
     """The small pictures side by side, member after member, `(height, width, 3)`."""
-    found = {i: pictures / f"{i:05d}.png" for i in range(len(table))}
-    found = {i: load_image(path) for i, path in found.items() if path.is_file()}
-    height, width = next(iter(found.values())).shape[:2] if found else (_SMALL, _SMALL)
-    small = min(_SMALL, _LARGE // max(rows, columns))
-    # Every so many pixels are averaged: no library is needed for that.
-    factor = max(1, -(-max(height, width) // max(small, 1)))
+    paths = {i: pictures / f"{i:05d}.png" for i in range(len(table))}
+    paths = {i: path for i, path in paths.items() if path.is_file()}
+    sizes = (load_image(path).shape[:2] for path in paths.values())
+    height, width = next(sizes, (_SMALL, _SMALL))
+    small = max(1, min(_SMALL, _LARGE // max(rows, columns)))
+    # Squares of so many pixels are averaged: no library is needed for that.
+    factor = -(-max(height, width) // small)
     shape = (height // factor, width // factor)
     whole = np.full((rows * shape[0], columns * shape[1], 3), 1.0)
     for i, status in enumerate(table["status"]):
-        tile = _shrunk(found[i], factor) if i in found else np.full((*shape, 3), _GREY)
+        known = i in paths
+        tile = _shrunk(load_image(paths[i]), factor) if known else np.full((*shape, 3), _GREY)
         if status == FAILED:
             tile = _framed(tile)
         row, column = divmod(i, columns)

@@ -1,7 +1,9 @@
 """A sweep that goes on: call after call, what is finished is kept."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from typing import final
 
 import numpy as np
@@ -13,6 +15,9 @@ from pgjax.sweeps.store import Store
 from pgjax.sweeps.table import Table
 
 Keep = Callable[[int, dict[str, np.ndarray]], None]
+
+# Seconds between two files of results: what is lost if the process is killed.
+_PATIENCE = 10
 
 
 @final
@@ -41,20 +46,22 @@ class Run:
         done = members_of(results)
         first, stride = share or (0, 1)
         mine = range(first, len(groups), stride)
-        left = [g for g in mine if not done.issuperset(groups[g].tolist())]
-        at_a_time = len(self.program.devices)
-        for start in range(0, len(left), at_a_time):
-            chosen = left[start : start + at_a_time]
-            found = self._called([groups[g] for g in chosen])
-            if self.keep is not None:
-                found = _handed_over(found, self.keep)
-            if self.store is not None:
-                self.store.add(chosen[0], found)
-            results.append(found)
-            done |= members_of([found])
-            if self.progress is not None:
-                self.progress(len(done), sum(map(len, groups)))
+        left = [groups[g] for g in mine if not done.issuperset(groups[g].tolist())]
+        with _writing(self.store) as write:
+            for found in self._calls(left):
+                write(found)
+                results.append(found)
+                done |= members_of([found])
+                if self.progress is not None:
+                    self.progress(len(done), self.layout.able)
         return self._finished(share is not None, results)
+
+    def _calls(self, groups: Sequence[np.ndarray]) -> Iterator[Results]:
+        """The results of call after call."""
+        at_a_time = len(self.program.devices)
+        for start in range(0, len(groups), at_a_time):
+            found = self._called(groups[start : start + at_a_time])
+            yield found if self.keep is None else _handed_over(found, self.keep)
 
     def _called(self, groups: Sequence[np.ndarray]) -> Results:
         """Run some groups, at most one for each device."""
@@ -88,6 +95,31 @@ class Run:
                 # Another process may just be reading.
                 self.store.clear()
         return table
+
+
+@contextlib.contextmanager
+def _writing(store: Store | None) -> Iterator[Callable[[Results], None]]:
+    """What takes results and writes those of some seconds at a time; the rest at the end."""
+    waiting: list[Results] = []
+    latest = time.monotonic()
+
+    def write_all() -> None:
+        if store is not None and waiting:
+            store.add(waiting)
+        waiting.clear()
+
+    def write(found: Results) -> None:
+        nonlocal latest
+        waiting.append(found)
+        if time.monotonic() - latest > _PATIENCE:
+            write_all()
+            latest = time.monotonic()
+
+    try:
+        yield write
+    finally:
+        # Also when it is interrupted.
+        write_all()
 
 
 def _handed_over(found: Results, keep: Keep) -> Results:

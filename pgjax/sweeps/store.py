@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, final
@@ -26,7 +26,7 @@ _LONGEST_RECORD = 1 << 20
 @final
 @dataclasses.dataclass(frozen=True)
 class Store:
-    """A folder of results, one file for each call of the program.
+    """A folder of results, a file for some calls of the program each.
 
     Attributes:
         folder: of the sweep.
@@ -41,9 +41,11 @@ class Store:
         """Where the files are."""
         return self.folder / "parts"
 
-    def add(self, group: int, results: Results) -> None:
-        """Keep the results of a call that began with this group."""
-        save_arrays(self.parts / f"{group:07d}.npz", results)
+    def add(self, results: Sequence[Results]) -> None:
+        """Keep the results of some calls, in one file."""
+        whole = {name: np.concatenate([r[name] for r in results]) for name in results[0]}
+        # No member is run twice: the first one names the file.
+        save_arrays(self.parts / f"{whole['member'][0]:07d}.npz", whole)
 
     def results(self) -> list[Results]:
         """All that was kept so far."""
@@ -81,7 +83,7 @@ def open_store(
             f"{f'the one in {folder} is finished' if finished else f'{folder} holds none'}."
         )
     if not path.is_file():
-        _require_empty(folder, shared)
+        require_empty(folder, shared=shared)
         path.parent.mkdir(parents=True, exist_ok=shared)
         _create(path, {"version": _VERSION, "lanes": lanes, "of": dict(marks)})
     elif not resume and not shared:
@@ -102,8 +104,9 @@ def _create(path: Path, record: Mapping[str, Any]) -> None:
     temporary.unlink()
 
 
-def _require_empty(folder: Path, shared: bool) -> None:
-    kept = {"parts"} if shared else set()
+def require_empty(folder: Path, *, shared: bool) -> None:
+    """Raise a `ValueError` if the folder holds anything that is not of a shared sweep."""
+    kept = {"parts", "sweep.csv"} if shared else set()
     if folder.is_file() or (folder.is_dir() and any(p.name not in kept for p in folder.iterdir())):
         raise ValueError(
             f"Argument `folder` must be a new or an empty folder, so that nothing is overwritten, "

@@ -14,7 +14,7 @@ from pgjax.sweeps.outcome import outcome
 from pgjax.sweeps.program import Measure, Program, Save, Task
 from pgjax.sweeps.results import tabulated
 from pgjax.sweeps.run import Keep, Run
-from pgjax.sweeps.store import fingerprint, open_store
+from pgjax.sweeps.store import fingerprint, open_store, require_empty
 from pgjax.sweeps.table import Table
 from pgjax.timestep import ELASTIC_FRACTION
 
@@ -42,7 +42,7 @@ def sweep(
     resume: bool = False,
     share: tuple[int, int] | None = None,
     keep: Keep | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: bool | Callable[[int, int], None] = False,
 ) -> Table:
     """Simulate many members of one scene, in one compiled program, and measure each.
 
@@ -66,8 +66,8 @@ def sweep(
             at rest is below it fails.
         fraction: part of the elastic limit, as for `stable_dt`.
         allow_unstable: accept a `dt` above the bound of a member.
-        at_once: members in a group. By default as many as there are threads for on a CPU, and as
-            `memory` allows elsewhere.
+        at_once: members in a group. By default as few as keep the threads of a CPU busy, and as
+            many as `memory` allows elsewhere. A sweep that goes on keeps the groups it began with.
         memory: bytes that the groups of one device may take; a part of what it has by default.
         devices: where to run; those of this process by default.
         folder: new or empty; results are kept there as they come, and `sweep.csv` at the end.
@@ -77,7 +77,7 @@ def sweep(
             that of this process of `jax.distributed`, if there are several.
         keep: takes the number and the arrays of each member as it is finished, which are then in
             no table.
-        progress: called as `progress(done, members)`.
+        progress: True shows a bar; a function is called as `progress(done, members)`.
 
     Returns:
         One row per member. With `share`, members that others have not finished are "pending".
@@ -101,7 +101,8 @@ def sweep(
         devices=devices,
     )
     task = Task(build, measure, save, frames, frame_dt)
-    return perform(layout, task, folder, resume=resume, share=share, keep=keep, progress=progress)
+    report = _bar() if progress is True else progress or None
+    return perform(layout, task, folder, resume=resume, share=share, keep=keep, progress=report)
 
 
 def perform(
@@ -117,7 +118,12 @@ def perform(
     """`sweep`, once it is laid out."""
     share = _share(share, folder)
     if not layout.able:
-        return tabulated(layout.members, layout.need, [])
+        table = tabulated(layout.members, layout.need, [])
+        if folder is not None:
+            require_empty(Path(folder), shared=share is not None)
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            table.to_csv(Path(folder) / "sweep.csv")
+        return table
     store = None
     if folder is not None:
         marks = fingerprint(layout, task)
@@ -151,3 +157,18 @@ def _share(share: tuple[int, int] | None, folder: str | Path | None) -> tuple[in
             "of them see, but is None."
         )
     return share
+
+
+def _bar() -> Callable[[int, int], None]:
+    """A progress bar in a terminal or a notebook."""
+    from tqdm.auto import tqdm  # Slow to import, needed here only.
+
+    bar = tqdm(unit="member")
+
+    def show(done: int, members: int) -> None:
+        bar.total = members
+        bar.update(done - bar.n)
+        if done >= members:
+            bar.close()
+
+    return show
