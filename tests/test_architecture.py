@@ -3,6 +3,8 @@
 import importlib
 import inspect
 import pkgutil
+import subprocess
+import sys
 
 import equinox as eqx
 
@@ -70,3 +72,11 @@ def test_public_names_have_one_import_path():
         }
         doubled = {n for n in offered & top if not inspect.ismodule(getattr(pgjax, n))}
         assert not doubled, f"{face.__name__} offers {doubled} too"
+
+
+def test_importing_loads_nothing_that_only_some_need():
+    """What takes long to import is loaded where it is used: `import pgjax` stays near a second."""
+    heavy = ("matplotlib", "imageio", "optax", "plyfile", "viser", "tqdm", "pgjax.scenes")
+    code = f"import sys, pgjax; print([m for m in {heavy!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
