@@ -164,9 +164,7 @@ def share(layout=None, devices=None):
     ("make", "message"),
     [
         (lambda: share(devices=()), "`devices` must hold devices of JAX"),
-        (lambda: share(devices=3), "`devices` must be a sequence"),
         (lambda: share(devices=jax.devices()[:1] * 2), "`devices` must name each device once"),
-        (lambda: share(layout="slabs"), "`layout` must be a AbstractLayout"),
         (lambda: parallel.Slabs(every=0), "`every` must be a whole number ≥ 1"),
         (lambda: parallel.Slabs(margin=-1), "`margin` must be a whole number ≥ 0"),
         (lambda: share(parallel.Slabs(axis=2)), "`axis` must be a direction from 0 to 1"),
