@@ -44,9 +44,10 @@ def test_the_limit_of_a_power_of_the_spacing_is_exact(order):
     np.testing.assert_allclose(limit.x, x, atol=1e-9)
     np.testing.assert_allclose(limit.order, order, rtol=1e-6)
     assert limit.converges
-    # Nothing speaks against it: a quarter of what was extrapolated is kept in doubt.
-    kept = 0.25 * largest(levels[-1] - x) / scale(x)
-    np.testing.assert_allclose(limit.doubt, kept, rtol=1e-3)
+    # Nothing speaks against it but that it might be of first order: a quarter is kept in doubt.
+    left = largest(levels[-1] - x) / scale(x)
+    if_first = left * (RATIO**order - 1) / (RATIO - 1)
+    np.testing.assert_allclose(limit.doubt, max(0.25 * left, abs(if_first - left)), rtol=1e-3)
     expected = largest(levels[0] - x) / scale(x)
     np.testing.assert_allclose(limit.error(levels[0]), expected, rtol=1e-3)
 

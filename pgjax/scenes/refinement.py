@@ -58,10 +58,12 @@ def refined(levels: Sequence[np.ndarray], ratio: float) -> Limit:
     """The limit of motions on finer and finer grids, from the last three.
 
     With the changes `Δ₁ = x₁ − x₀`, `Δ₂ = x₂ − x₁` and `q = |Δ₂|/|Δ₁| = ratio^(−p)`, the order p
-    bounded to between 1/2 and 2, it is `x₂ + e` with `e = Δ₂ q/(1 − q)`. It is in doubt by
-    `|Δ₂ − q Δ₁| q/(1 − q)`, what the changes do not have in common, but at least by a quarter of e
-    (after P. J. Roache's grid convergence index, 1994), and by all of it where the order is below
-    1/2. Where the changes do not approach anything the limit is x₂, in doubt by `|Δ₂| q/(1 − q)`.
+    bounded to between 1/2 and 2, it is `x₂ + e(p)` with `e(p) = Δ₂ q/(1 − q)`. It is in doubt by
+    the largest of: `|Δ₂ − q Δ₁| q/(1 − q)`, what the changes do not have in common; a quarter of
+    e(p), after P. J. Roache's grid convergence index, 1994; and its distance from e(1), since walls
+    and free surfaces are of first order, whatever three grids show; it is all of e(p) where the
+    order is below 1/2. Where the changes do not approach anything the limit is x₂, and e(p) the
+    doubt.
 
     Args:
         levels: at least three motions `(f, n, 3)`, coarse to fine, of the same Gaussians.
@@ -77,11 +79,13 @@ def refined(levels: Sequence[np.ndarray], ratio: float) -> Limit:
     q = ratio ** -float(np.clip(order, _LOWEST, _HIGHEST))
     norms = float(np.linalg.norm(first) * np.linalg.norm(second))
     coherence = float(np.sum(first * second)) / norms if norms > 0 else 0.0
-    ahead = q / (1 - q)
+    ahead, ahead_of_first_order = q / (1 - q), 1 / (ratio - 1)
+    x, doubt = x2, ahead * d2
     if order > 0 and coherence > _COHERENT:
-        least = (_SAFETY if order >= _LOWEST else 1.0) * d2
-        x, doubt = x2 + ahead * second, ahead * max(largest(second - q * first), least)
-    else:
-        x, doubt = x2, ahead * d2
+        x = x2 + ahead * second
+        least = (
+            max(_SAFETY * ahead, abs(ahead - ahead_of_first_order)) if order > _LOWEST else ahead
+        )
+        doubt = max(ahead * largest(second - q * first), least * d2)
     changes = (d1 / size, d2 / size)
     return Limit(x, doubt / size, order, changes, order > 0 and coherence > 0, size)
