@@ -11,6 +11,7 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.core import Tracer
 from scene_files import DROP, ball, write
 from test_docs import run_blocks
 
@@ -499,3 +500,24 @@ def test_the_mosaic_has_a_place_for_each_member(tmp_path):
     np.testing.assert_allclose(centres[:, :2], [[0, 1 / 8], [3 / 8, 4 / 8]], atol=0.01)
     np.testing.assert_allclose(centres[:, 2], [2 / 8, 0.85], atol=0.01)
     assert tiles[0, 60, 0] > 2 * tiles[0, 60, 1]
+
+
+def test_few_scenes_are_built_to_find_those_that_cannot_be():
+    built = []
+
+    def counted(values):
+        if jnp.ndim(values["E"]) == 0 and not isinstance(values["E"], Tracer):
+            built.append(float(values["E"]))
+        return build(values)
+
+    # Ends that are refused, also for the sake of another parameter; what lies between is not asked.
+    stiffness = [-2.0, 0.0, *np.linspace(1e4, 2e4, 50)]
+    members = combined({"E": stiffness, "nu": [0.5, 0.3, 0.2]})
+    found = needs(counted, members, FRAME, dt=None, fraction=0.5, allow_unstable=False)
+    unusable = (members.values["E"] <= 0) | (members.values["nu"] == 0.5)
+    assert np.array_equal(found.substeps == 0, unusable)
+    assert sorted(found.errors) == np.flatnonzero(unusable).tolist()
+    assert "`E` must be positive" in found.errors[1]
+    assert "`nu` must be below 0.5" in found.errors[6]
+    assert set(built) >= {-2.0, 0.0, 1e4, 2e4}
+    assert len(built) < len(members) / 2

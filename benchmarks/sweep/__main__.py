@@ -122,7 +122,8 @@ def page(rows: list[Row], facts: dict[str, Any]) -> str:
         f"Written by `{facts['command']}` on {facts['date']}: {facts['cores']} cores of "
         f"{facts['cpu']}; "
         + ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
-        + ".",
+        + ". Processes that ran or waited to run meanwhile, these among them: "
+        f"{min(facts['load']):.0f} to {max(facts['load']):.0f} (load average).",
         "",
         "A block of eight particles per cell is thrown on the floor, with as many stiffnesses and "
         "Poisson's ratios as members; float32, quadratic splines, MLS, the same time step for all. "
@@ -158,17 +159,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
     options = parser.parse_args()
     cores = len(os.sched_getaffinity(0))
-    rows = []
+    rows, load = [], [os.getloadavg()[0]]
     for place, case in enumerate(QUICK if options.quick else FULL + SIZES):
         row = measured(case, 2 if case in FULL else 3, cores)
         if place == 0:
             row = dataclasses.replace(row, processes=in_processes(case, 1 if options.quick else 3))
         rows.append(row)
+        load.append(os.getloadavg()[0])
     facts = {
         "command": "python -m benchmarks.sweep" + (" --quick" if options.quick else ""),
         "date": time.strftime("%Y-%m-%d"),
         "cpu": cpu(),
         "cores": cores,
+        "load": load,
         "versions": versions(("pgjax", "jax", "jaxlib", "numpy")),
     }
     content = {"about": facts, "rows": [dataclasses.asdict(row) for row in rows]}

@@ -46,9 +46,9 @@ def needs(
 ) -> Need:
     """The steps per frame of each member, and the errors of those that cannot be simulated.
 
-    A member whose scene cannot be built has the error that `build` raises. As that takes long, it
-    is called for one member with each value of each parameter, and for all members with a value
-    whose first member it refuses.
+    A member whose scene cannot be built has the error that `build` raises. As that takes long, not
+    all are built: the allowed values of a parameter are taken for an interval, whose ends are
+    looked for from the smallest and the largest value inwards.
     """
     errors = _refused(build, members)
     recommended, rest = _limits(build, members, fraction)
@@ -91,11 +91,11 @@ def _reason(build: Build, members: Members, index: int) -> str | None:
 
 
 def _refused(build: Build, members: Members) -> dict[int, str]:
+    """The members whose scene cannot be built, and why."""
     errors: dict[int, str] = {}
     asked: set[int] = set()
 
-    def ask(index: int) -> bool:
-        """Whether a member is refused."""
+    def refused(index: int) -> bool:
         if index not in asked:
             asked.add(index)
             reason = _reason(build, members, index)
@@ -103,14 +103,20 @@ def _refused(build: Build, members: Members) -> dict[int, str]:
                 errors[index] = reason
         return index in errors
 
+    def refused_everywhere(having: np.ndarray) -> bool:
+        """Whether all members with a value are refused; of some it may be for another's sake."""
+        # From the middle on, where the other values are rather those that are allowed.
+        return all(refused(int(i)) for i in np.roll(having, -(len(having) // 2)))
+
     for values in members.values.values():
         _, which = np.unique(values, axis=0, return_inverse=True)
-        which = which.reshape(-1)
-        for value in range(which.max() + 1):
-            having = np.flatnonzero(which == value)
-            if ask(int(having[0])):
-                for index in having:
-                    ask(int(index))
+        order = np.argsort(which.reshape(-1), kind="stable")
+        having = np.split(order, np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1)
+        # From both ends inwards: what is allowed is an interval.
+        for inwards in (having, having[::-1]):
+            for some in inwards:
+                if not refused_everywhere(some):
+                    break
     return errors
 
 
