@@ -1,5 +1,6 @@
 """Constitutive laws: a material sees one deformation gradient and nothing of the grid."""
 
+from pgjax._types import parameter as parameter
 from pgjax.models.active import ActiveStress as ActiveStress
 from pgjax.models.elasticity import DevVolNeoHookean as DevVolNeoHookean
 from pgjax.models.elasticity import FixedCorotated as FixedCorotated
