@@ -40,15 +40,18 @@ class Costs:
     remark: str = ""
 
 
-def timed(program: Callable, *arguments: Any) -> float:
-    """Median seconds of five runs, of three if they are long; a first one does not count."""
-    times, runs = [], RUNS
+def timed(program: Callable, *arguments: Any) -> tuple[float, Any]:
+    """Median seconds of five runs, of three if they are long, and the result.
+
+    A first run does not count.
+    """
+    times, runs, result = [], RUNS, None
     while len(times) < runs + 1:
         started = time.perf_counter()
-        jax.block_until_ready(program(*arguments))
+        result = jax.block_until_ready(program(*arguments))
         times.append(time.perf_counter() - started)
         runs = 3 if times[0] > LONG else RUNS
-    return statistics.median(times[1:])
+    return statistics.median(times[1:]), result
 
 
 def temporary(program: Any) -> float:
@@ -78,7 +81,8 @@ def watched(*, backward: bool = False) -> Iterator[Costs]:
         compilation = time.perf_counter() - started
         # The same program as before, which is found again?
         costs.compile = compilation if compilation > FOUND else None
-        costs.seconds, costs.memory = timed(program, *arguments), temporary(program)
+        costs.seconds, _ = timed(program, *arguments)
+        costs.memory = temporary(program)
         costs.particles, costs.steps = len(state.v), steps
         if backward:
             block = math.ceil(math.sqrt(steps))
@@ -112,9 +116,8 @@ def backward_seconds(
     E = jnp.asarray(scene.materials[0].elasticity.E, state.dtype)
     arguments = E, state.v, scene, state, dt
     program = eqx.filter_jit(jax.value_and_grad(value, argnums=(0, 1))).lower(*arguments).compile()
-    _, slopes = program(*arguments)
-    finite = all(bool(jnp.all(jnp.isfinite(a))) for a in slopes)
-    return timed(program, *arguments), finite
+    seconds, (_, slopes) = timed(program, *arguments)
+    return seconds, all(bool(jnp.all(jnp.isfinite(a))) for a in slopes)
 
 
 def with_modulus(scene: Scene, E: Any) -> Scene:
