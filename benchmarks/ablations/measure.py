@@ -39,7 +39,7 @@ def rollout(scene: Scene, state: State, *, seconds: float, dt: float, **options:
     """A simulation of so many seconds in steps of at most dt, s, compiled."""
     steps = max(1, round(seconds / dt))
 
-    def final(scene: Scene, state: State) -> State:
+    def final(scene: Scene, state: State) -> tuple[State, Any]:
         run = pgjax.simulate(
             scene,
             state,
@@ -51,14 +51,15 @@ def rollout(scene: Scene, state: State, *, seconds: float, dt: float, **options:
             allow_unstable=True,
             **options,
         )
-        return run.final
+        # Without its accounts among the results a program would not compute them.
+        return run.final, run.ledger
 
     started = time.perf_counter()
     compiled = jax.jit(final).lower(scene, state).compile()
     compiling = time.perf_counter() - started
     sizes: Any = compiled.memory_analysis()
     memory = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
-    return Program(lambda: compiled(scene, state), memory, compiling)
+    return Program(lambda: compiled(scene, state)[0], memory, compiling)
 
 
 def _nothing(state: State) -> None:

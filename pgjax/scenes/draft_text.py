@@ -192,6 +192,8 @@ def _grid(choices: Choices, made: Plan | None) -> list[str]:
             f"motion and takes 2 (a surface) to 16 times (a solid) as long."
         )
     lines.append(f"spacing = {choices.spacing:g}")
+    lines += _comment("The fastest to an error of some per cent; spline-gradient is the other one.")
+    lines.append('scheme = "mls"')
     return lines
 
 
