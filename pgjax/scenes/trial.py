@@ -106,7 +106,7 @@ class Trials:
 
     Attributes:
         done: what was run, in order.
-        left_out: what would have taken too long, a line each.
+        left_out: what would have taken too long, by its name, with its cost.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Trials:
             raise ValueError(f"Argument `budget` must be above 0, but is {budget:g}.")
         self.file, self.frames = file, frames
         self.done: list[Trial] = []
-        self.left_out: list[str] = []
+        self.left_out: dict[str, str] = {}
         self._report = report
         self._deadline = time.perf_counter() + budget
         self._compiling, self._step = _COMPILING, _STEP
@@ -143,7 +143,7 @@ class Trials:
         seconds = self._compiling + work * self._step * (2 if double else 1)
         text = f"{what}: {setting}; {work:.3g} particle-steps, about {seconds:.0f} s"
         if started + seconds > self._deadline:
-            self.left_out.append(text)
+            self.left_out[f"{what}: {setting}"] = text
             return None
         if self._report is not None:
             self._report(text)

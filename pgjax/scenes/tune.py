@@ -240,14 +240,20 @@ def _notes(
     if not limit.converges:
         yield (
             f"the grids do not converge: the motion changes by {100 * before:.2g} % and then by "
-            f"{100 * last:.2g} % (fracture and flow may be different on every grid)"
+            f"{100 * last:.2g} % (fracture and flow may be different on every grid; walls are "
+            f"where their nodes are)"
         )
-    if chosen is None:
+    if chosen is not None:
+        yield from chosen.trial.messages
+    elif limit.doubt >= asked:
+        yield (
+            f"nothing can be said to be within {100 * asked:.3g} %: the limit itself is in doubt "
+            f"by {100 * limit.doubt:.2g} %"
+        )
+    else:
         best = min(rows, key=lambda r: r.error)
         yield (
             f"nothing is within {100 * asked:.3g} %: the nearest is {best.trial.setting}, "
             f"{100 * best.error:.2g} % from a limit that is in doubt by {100 * limit.doubt:.2g} %"
         )
-    else:
-        yield from chosen.trial.messages
-    yield from (f"left out for lack of time: {text}" for text in trials.left_out)
+    yield from (f"left out for lack of time: {text}" for text in trials.left_out.values())
