@@ -35,8 +35,13 @@ def found(*cases, native_kernels=True):
 
 
 def quick(case):
-    """What one of the cheap cases measures: all of them share a process."""
-    return found("bar_forward", "laws", "periodic", "overflow")[case]
+    """What one of the cheap cases measures: they share a process."""
+    return found("bar_forward", "overflow")[case]
+
+
+def slower(case):
+    """What one of the others measures: they share another one."""
+    return found("laws", "periodic")[case]
 
 
 def test_a_bar_that_crosses_slabs():
@@ -56,17 +61,19 @@ def check_bar(case):
         assert case[f"{name} saved"] < 1e-10
 
 
+@pytest.mark.slow
 def test_laws_and_conditions():
     """Three laws, forces and prescribed motion; a particle that leaves is counted once."""
-    case = quick("laws")
+    case = slower("laws")
     assert case["lost"] == 1
     assert case["status"] == 0
     assert case["slabs"] < 1e-10
 
 
+@pytest.mark.slow
 def test_periodic_direction():
     """Around the seam, with derivatives by stiffness and velocity."""
-    case = quick("periodic")
+    case = slower("periodic")
     assert case["around"] > 0.05
     assert case["slabs"] < 1e-10
     assert case["slopes"] < 1e-9
