@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 SCENES = {"ficus": 8, "jam": 30, "plane": 20}
 ASKED = (0.05, 0.02)
 # Seconds for tuning one scene; the fine run is not counted.
-BUDGET = 400.0
+BUDGET = 1000.0
 
 
 def main() -> int:
