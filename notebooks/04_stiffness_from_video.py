@@ -15,7 +15,7 @@
 # video alone come Young's modulus, Poisson's ratio and how fast the plate was, with intervals. It is
 # done twice: with a film made by the estimator's own discretisation (tier *self*), and with one from
 # another grid, other particles and another time step (tier *cross*), which is what a real film is
-# like. It takes about three minutes on two cores.
+# like. It takes about a minute on two cores.
 
 # %%
 import math
