@@ -26,7 +26,9 @@ NOTE = (
     "particles may change over after every step, and half as many places again as the fullest "
     "slab has particles; *nobody changes over*: the same without looking; *no empty places*: "
     "moreover as many places as particles. *Sum of the grid* and *five layers*: the exchange of a "
-    "step by itself. Two simulated devices share the memory of one processor: the numbers say what "
+    "step by itself. The material fills a corner, so that one of two slabs is wide and mostly "
+    "empty. *simulate* leaves out nodes without mass, which a shared scene does not. Two simulated "
+    "devices share the memory of one processor: the numbers say what "
     "exchange and bookkeeping cost, not how many devices scale."
 )
 
