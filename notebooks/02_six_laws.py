@@ -193,7 +193,7 @@ def squeezed(p):
 
 
 rates, pressures = [1.0, 10.0], [5e3, 1e4]  # 1/s, Pa
-figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained", sharex=True)
+figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained", sharex=True)
 tau = np.asarray(shear(laws["von Mises"], cycle, 1e-3, rest))[:, 0, 1]
 axes[0].plot(gamma_cycle, tau / 1e3, label="von Mises")
 flows = {"von Mises": (np.abs(tau[[299, 899, 1499]]), tau_Y / math.sqrt(2))}
@@ -217,7 +217,7 @@ for axis, name in zip(axes, ["von Mises", "Drucker–Prager", "Herschel–Bulkle
             axis.axhline(level / 1e3, color="k", ls=":", lw=1)
             axis.axhline(-level / 1e3, color="k", ls=":", lw=1)
     axis.set(title=name, xlabel=r"shear $\gamma$", ylabel=r"shear stress $\tau_{12}$, kPa")
-    axis.legend(loc="lower right")
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
 plt.show()
 
 # %% [markdown]
@@ -330,7 +330,7 @@ for name, height in heights.items():
     plt.plot(t, height, "-" if name in elastic else "--", label=name)
 plt.xlabel("time, s")
 plt.ylabel("height of the fox, m")
-plt.legend(fontsize=8, ncols=2)
+plt.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
 plt.show()
 
 # %% [markdown]

@@ -294,7 +294,7 @@ plt.show()
 # ## Jam: where it stops, and when
 #
 # A dollop slumps on a plate. The yield stress says where it stops, the viscosity how long that
-# takes.
+# takes: the two thick ones are still creeping when the film ends.
 
 # %%
 h = width / (8 if FAST else 12)
@@ -317,14 +317,14 @@ height = x_jam[..., 1].max(axis=2) / width
 front = np.quantile(x_jam[..., 0], 0.99, axis=2) / width
 half = [np.interp(0.5 * (1 + f[-1]), f, t_jam) for f in front]  # s
 
-plt.figure(figsize=(7, 3.4), layout="constrained")
+plt.figure(figsize=(8.5, 3.4), layout="constrained")
 for (sigma_Y, eta), path in zip(recipes, front, strict=True):
     color, style = ("C0" if sigma_Y == 150 else "C1"), ("-" if eta == 20 else "--")
     label = rf"$\sigma_Y$ = {sigma_Y:.0f} Pa, $\eta$ = {eta:.0f} Pa s"
     plt.plot(t_jam, path, style, color=color, label=label)
 plt.xlabel("time, s")
 plt.ylabel("front over width")
-plt.legend()
+plt.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
 plt.show()
 
 # %% [markdown]
@@ -362,7 +362,7 @@ def drawn(f):
 
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "flows.mp4"
-    render.save_video(path, (drawn(f) for f in range(frames + 1)), fps=12)
+    render.save_video(path, map(drawn, range(frames + 1)), fps=12)
     video = Video(path.read_bytes(), embed=True, mimetype="video/mp4", width=640)
 plt.show()
 video
