@@ -209,23 +209,26 @@ def _walk(
 ) -> None:
     """Run a setting on the rung where it should be good enough, and then coarser or finer."""
     start = own(trials.file).spacing
+
+    def spacing(rung: int) -> float:
+        """Of the grid of a rung, m."""
+        return float(f"{start / RATIO**rung:.4g}")
+
     rung = round(math.log(start / merged.spacing, RATIO))
     left = _MARGIN * (asked - limit.doubt)
     error, order = expected
     rung += math.ceil(math.log(max(error, 1e-9) / left, RATIO) / order - 1e-9)
-    tried: dict[int, bool] = {}
+    coarsest = next(r for r in range(_COARSEST, 1) if r == 0 or _fits(trials.file, spacing(r)))
+    tried: set[int] = set()
     for _ in range(_TRIES):
-        rung = min(max(rung, _COARSEST), _FINEST)
+        rung = min(max(rung, coarsest), _FINEST)
         if rung in tried:
             return
-        spacing = float(f"{start / RATIO**rung:.4g}")
-        if not _fits(trials.file, spacing):
-            return
-        trial = trials.run("together", dataclasses.replace(merged, spacing=spacing))
+        trial = trials.run("together", dataclasses.replace(merged, spacing=spacing(rung)))
         if trial is None:
             return
         good = trial.x is not None and limit.error(trial.x) + limit.doubt <= asked
-        tried[rung] = good
+        tried.add(rung)
         best = _cheapest(_rows(trials, limit), limit, asked)
         if not good and best is not None and best.trial.seconds <= trial.seconds:
             return
