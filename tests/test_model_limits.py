@@ -206,7 +206,7 @@ def test_stress_in_float32_is_accurate_at_every_strain(name):
             exact = np.array([EXACT[name](h + I3) for h in H.astype(np.float64)])
             error.append(norm(np.asarray(tau) - exact) / norm(exact))
         assert np.quantile(error, 0.95) < 6e-7
-        assert np.max(error) < 1e-6
+        assert np.max(error) < 2e-6
 
 
 # --- Bad input -----------------------------------------------------------------------------------
