@@ -22,7 +22,7 @@ class Flows(eqx.Module):
     """What went in and out since the first step.
 
     Attributes:
-        forces: work of forces on particles, J.
+        forces: work of forces and of prescribed motion of particles, J.
         push: momentum that forces and prescribed motion of particles gave, N s, `(d,)`.
         walls: work of the conditions of the grid, J: their impulse times the velocity the nodes
             have after it. Friction is negative, a wall at rest without friction does none.
@@ -177,7 +177,7 @@ def followed(scene: Scene, before: State, stages: Stages, flows: Flows, dt: Scal
     # G2P keeps momentum: what the particles have more was given by what leads some of them.
     led = new.momentum - nodes.momentum if scene.particle_conditions else 0
     return Flows(
-        forces=flows.forces + imposed.energy - old.energy,
+        forces=flows.forces + imposed.energy - old.energy + nodes.leading,
         push=flows.push + imposed.momentum - old.momentum + led,
         walls=flows.walls + nodes.work,
         impulse=flows.impulse + nodes.impulse,
@@ -203,11 +203,12 @@ def motion(scene: Scene, state: State) -> Motion:
 
 
 class _Nodes(NamedTuple):
-    """On the grid in one step: momentum after it, what the walls gave, what damping took."""
+    """On the grid in one step: momentum after walls, what walls, led nodes and damping did."""
 
     momentum: Float[Array, " d"]
     impulse: Float[Array, " d"]
     work: Scalar
+    leading: Scalar
     damped: Scalar
 
 
@@ -216,13 +217,14 @@ def _on_nodes(scene: Scene, stages: Stages, dt: Scalar) -> _Nodes:
     v = safe_divide(momentum, jnp.broadcast_to(mass, momentum.shape))
     free = jnp.where(mass > 0, v + jnp.broadcast_to(dt * scene.gravity, v.shape), 0)
     damped = jnp.exp(-scene.grid_damping * dt) * free
-    moved = stages.moved[..., :-1]
-    given = mass * (moved - damped)
+    walled, moved = stages.walled[..., :-1], stages.moved[..., :-1]
+    given = mass * (walled - damped)
     nodes = tuple(range(scene.grid.dimension))
     return _Nodes(
-        momentum=jnp.sum(mass * moved, axis=nodes),
+        momentum=jnp.sum(mass * walled, axis=nodes),
         impulse=jnp.sum(given, axis=nodes),
-        work=jnp.sum(given * moved),
+        work=jnp.sum(given * walled),
+        leading=jnp.sum(mass * (moved - walled) * moved),
         damped=jnp.sum(mass * (free**2 - damped**2)) / 2,
     )
 

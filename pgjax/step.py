@@ -12,7 +12,7 @@ import numpy as np
 from pgjax import native
 from pgjax._safe import safe_divide
 from pgjax._types import Array, Bool, Float, Int, Scalar
-from pgjax.boundary import AbstractGridCondition, Box, Particles, Region, sweep
+from pgjax.boundary import AbstractGridCondition, Box, Particles, Region, change_if, sweep
 from pgjax.exchange import EVENTS, Receiver, Sender, embed, is_finite, receive, send, where
 from pgjax.fused import known, receive_natively, send_natively, velocities
 from pgjax.grid import PAD, Grid
@@ -21,7 +21,7 @@ from pgjax.models.material import Material, cast, particle_axes
 from pgjax.result import Condition
 from pgjax.scene import Scene
 from pgjax.state import State
-from pgjax.transfer import MLS, SplineGradient, Stencil, stencil
+from pgjax.transfer import MLS, Payload, SplineGradient, Stencil, scatter, stencil
 
 Vectors = Float[Array, "d n"]
 
@@ -52,12 +52,14 @@ class Stages(NamedTuple):
     Attributes:
         imposed: the state under forces and prescribed motion of particles.
         nodes: momentum and mass of the nodes, internal forces already in the momentum.
-        moved: their velocity under gravity, damping and walls, and their mass.
+        walled: their velocity under gravity, damping and walls, and their mass.
+        moved: the same once those that are led have the velocity of what leads them.
         after: the state one step later.
     """
 
     imposed: State
     nodes: Float[Array, "*grid c"]
+    walled: Float[Array, "*grid c"]
     moved: Float[Array, "*grid c"]
     after: State
 
@@ -77,9 +79,10 @@ def followed_step(
     at, inside = stencil(scene.grid, scene.spline, imposed.position)
     sent, finite, nodes = particles_to_grid(scene, imposed, at, inside, t, dt, whole=whole)
     box = None if whole else box_of(scene.grid, at)
-    moved = forces_and_boundaries(scene, region_of(scene.grid, at), nodes, t, dt, box=box)
+    walled = forces_and_boundaries(scene, region_of(scene.grid, at), nodes, t, dt, box=box)
+    moved = led(walled, led_nodes(scene, sent, at, held), held)
     after = grid_to_particles(scene, sent, at, finite, held, moved, dt)
-    return Stages(imposed, nodes, moved, after)
+    return Stages(imposed, nodes, walled, moved, after)
 
 
 def leaves_nodes_out(scene: Scene) -> bool:
@@ -226,6 +229,38 @@ def forces_and_boundaries(
         return jnp.concatenate([jnp.where(mass > 0, v, 0), mass])
 
     return sweep(scene.grid, constrained, momentum_and_mass, region)
+
+
+def led_nodes(
+    scene: Scene, state: State, at: Stencil, held: Bool[Array, " p"]
+) -> Float[Array, "*grid c"] | None:
+    """Momentum and mass of the nodes, of led particles alone; None where no condition leads any."""
+    if not any(getattr(condition, "leads", True) for condition in scene.particle_conditions):
+        return None
+    mass = jnp.where(held & state.alive, scene.masses, 0)[:, None]
+    v, C = (where(state.alive, a, 0) for a in (state.v, state.C))
+    values = jnp.concatenate([mass * v, mass], axis=1)
+    return scatter(scene.grid, at, Payload(values, mass[:, :, None] * C, None))
+
+
+def led(
+    moved: Float[Array, "*grid c"], leading: Float[Array, "*grid c"] | None, held: Bool[Array, " p"]
+) -> Float[Array, "*grid c"]:
+    """The nodes most of whose mass is led have the velocity of what leads them.
+
+    Led particles that only kept their own velocity would be a dashpot: what hangs from them would
+    creep, at a speed in proportion to Δt, until it tears off.
+    """
+    if leading is None:
+        return moved
+
+    def take_over(moved: Float[Array, "*grid c"]) -> Float[Array, "*grid c"]:
+        momentum, mass = leading[..., :-1], leading[..., -1:]
+        v = safe_divide(momentum, jnp.broadcast_to(mass, momentum.shape))
+        own, total = moved[..., :-1], moved[..., -1:]
+        return jnp.concatenate([jnp.where(2 * mass > total, v, own), total], axis=-1)
+
+    return change_if(jnp.any(held), take_over, moved)
 
 
 def box_of(grid: Grid, at: Stencil) -> Int[Array, " _"]:

@@ -11,6 +11,7 @@ from pgjax.boundary.motion import AbstractMotion as AbstractMotion
 from pgjax.boundary.motion import KeyFrames as KeyFrames
 from pgjax.boundary.motion import Steady as Steady
 from pgjax.boundary.nodes import Region as Region
+from pgjax.boundary.nodes import change_if as change_if
 from pgjax.boundary.nodes import sweep as sweep
 from pgjax.boundary.particles import AbstractParticleCondition as AbstractParticleCondition
 from pgjax.boundary.particles import ParticleForce as ParticleForce

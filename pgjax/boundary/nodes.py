@@ -37,7 +37,7 @@ def branches() -> bool:
     return jax.default_backend() == "cpu" and not jax.sharding.get_abstract_mesh().manual_axes
 
 
-def change_if(needed: Bool[Array, ""], change: Callable[[Vectors], Vectors], v: Vectors) -> Vectors:
+def change_if(needed: Bool[Array, ""], change: Callable[[Array], Array], v: Array) -> Array:
     """`change(v)`, which leaves v as it is unless `needed`; then it is skipped where that pays."""
     return jax.lax.cond(needed, change, lambda v: v, v) if branches() else change(v)
 

@@ -7,7 +7,7 @@ any callable will do.
 import abc
 import reprlib
 from collections.abc import Callable
-from typing import Any, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -42,7 +42,8 @@ class Particles(NamedTuple):
         v: velocities, m/s, `(p, d)`.
         C: affine velocities, 1/s, `(p, d, d)`.
         mass: kg, `(p,)`; 0 for a particle that was masked.
-        held: which particles keep v and C through the step, whatever pulls at them, `(p,)`.
+        held: which particles keep v and C through the step, whatever pulls at them, `(p,)`; nodes
+            most of whose mass is theirs move with them.
     """
 
     x: Float[Array, "p d"]
@@ -53,9 +54,14 @@ class Particles(NamedTuple):
 
 
 class AbstractParticleCondition(eqx.Module):
-    """Something that acts on some of the particles."""
+    """Something that acts on some of the particles.
+
+    Attributes:
+        leads: whether it may set `held`; then the nodes around are led, too, which costs time.
+    """
 
     mask: eqx.AbstractVar[Array | None]
+    leads: ClassVar[bool] = True
 
     @abc.abstractmethod
     def __call__(self, particles: Particles, t: Scalar, dt: Scalar) -> Particles:
@@ -77,6 +83,7 @@ def _as_mask(value: Any) -> Array:
 class ParticleMotion(AbstractParticleCondition):
     """Particles of a region are led along a rigid motion, whatever pulls at them.
 
+    So are the nodes most of whose mass is theirs: what hangs from them is clamped there.
     `ParticleMotion(mask, Steady((0, 0, 0)))` holds them where they are. In a time window they are
     led from where they are when it starts, and free again when it ends; one end per particle
     releases them one after the other (`release_times`).
@@ -159,6 +166,7 @@ class ParticleImpulse(AbstractParticleCondition):
         duration: how long it lasts, s; at least one step is taken.
     """
 
+    leads: ClassVar[bool] = False
     mask: Array = eqx.field(converter=_as_mask)
     momentum: Array = eqx.field(converter=numbers("momentum"))
     start: Array = parameter(default=0.0)
@@ -191,6 +199,7 @@ class ParticleForce(AbstractParticleCondition):
         end: end of the window, s.
     """
 
+    leads: ClassVar[bool] = False
     mask: Array = eqx.field(converter=_as_mask)
     force: Array = eqx.field(converter=numbers("force"))
     start: Array = parameter(default=0.0)
@@ -225,6 +234,7 @@ class Wind(AbstractParticleCondition):
         end: end of the window, s.
     """
 
+    leads: ClassVar[bool] = False
     velocity: Array | Callable[[Any, Any], Any]
     rate: Array = parameter()
     quadratic: Array = parameter()

@@ -46,6 +46,8 @@ from pgjax.step import (
     forces_and_boundaries,
     grid_to_particles,
     impose,
+    led,
+    led_nodes,
     particles_to_grid,
 )
 
@@ -234,8 +236,8 @@ class Device:
     def _own(self, stages: Stages) -> Stages:
         """With the nodes that this device accounts for alone."""
         own = self.plan.own(stages.nodes)
-        nodes, moved = (jnp.where(own, a, 0) for a in (stages.nodes, stages.moved))
-        return stages._replace(nodes=nodes, moved=moved)
+        of_nodes = {k: jnp.where(own, getattr(stages, k), 0) for k in ("nodes", "walled", "moved")}
+        return stages._replace(**of_nodes)
 
     def noted(self, note: Callable[[Scene, State, Scalar], State], parts: Parts) -> Parts:
         """What is looked at once a frame."""
@@ -258,6 +260,8 @@ def _step(plan: AbstractPlan, scene: Scene, state: State, dt: Scalar) -> Stages:
     nodes = plan.added(nodes)
     # Other devices' nodes are not known to lie anywhere.
     infinity = jnp.full((scene.grid.dimension,), jnp.inf, state.dtype)
-    moved = forces_and_boundaries(scene, Region(-infinity, infinity), nodes, t, dt)
+    walled = forces_and_boundaries(scene, Region(-infinity, infinity), nodes, t, dt)
+    leading = led_nodes(scene, sent, at, held)
+    moved = led(walled, None if leading is None else plan.added(leading), held)
     after = grid_to_particles(scene, sent, at, finite, held, moved, dt)
-    return Stages(imposed, nodes, moved, after)
+    return Stages(imposed, nodes, walled, moved, after)
