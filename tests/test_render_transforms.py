@@ -215,7 +215,11 @@ def test_gradients_through_frames():
     assert_equal(over_frames(scene.means), expected)
 
 
-@pytest.mark.parametrize("switch", ["1", "0"], ids=["native", "plain"])
+@pytest.mark.parametrize(
+    "switch",
+    ["1", pytest.param("0", marks=pytest.mark.slow)],
+    ids=["native", "plain"],
+)
 def test_shards_of_a_batch(monkeypatch, switch):
     monkeypatch.setenv("PGJAX_NATIVE", switch)
     jax.clear_caches()

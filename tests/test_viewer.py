@@ -312,7 +312,7 @@ def test_ctrl_c_ends_it(folder):
     with urllib.request.urlopen(url, timeout=10) as page:
         assert page.status == 200
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=240)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors
     # Another program may take the port meanwhile; nobody of ours listens on it.

@@ -148,6 +148,7 @@ def test_impact_has_every_state(measure):
     measure("V44", "500 steps, nine laws: loop of step = simulate", error, below=1e-13)
 
 
+@pytest.mark.slow
 def test_forward_reverse_and_differences_agree(measure, capsys):
     """G3 over an impact of 500 steps, for every parameter of every law."""
     p, dt = base()
