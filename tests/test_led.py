@@ -67,7 +67,7 @@ def test_a_held_end_carries_a_beam(measure):
     measure(
         "held beam", "deepest sag / twice the static", sag.max() / (2 * static), within=(0.95, 1.08)
     )
-    # Back where it was, a period later: a fit to the times on either side of the lowest point.
+    # Lowest in the middle, and back where it was a period later.
     half = np.argmax(sag) / 50 * period
     measure("held beam", "half a period / first mode", 2 * half / period, within=(0.93, 1.1))
     measure("held beam", "sag after one period", sag[-1] / sag.max(), below=0.08)

@@ -45,8 +45,10 @@ def write(path: Path, rows: list[dict]) -> None:
         f"finer than all that were looked at for it. Errors are the largest over the frames of the "
         f"root mean square over the Gaussians, in the scale of the scene "
         f"([what that is](../../docs/choosing-step-and-spacing.md)); times are of the simulation "
-        f"alone, without pictures, those of a row measured side by side. The demand: the true "
-        f"error is at most twice what was asked.",
+        f"alone, without pictures, those of a row measured side by side. Scenes that were not "
+        f"run at that date have the rows of an earlier run, on another machine; microphone and jam "
+        f"are from before led particles led their nodes. The demand: the true error "
+        f"is at most twice what was asked.",
         "",
         "| scene | frames | asked | chosen | predicted | in doubt by | true | against | met | "
         "ms a frame | its own | true error of its own | times as fast |",
