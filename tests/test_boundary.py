@@ -24,6 +24,9 @@ SHAPES_3D = {
     "turned cuboid": boundary.Cuboid((0.1, 0.0, -0.1), (0.6, 0.4, 0.3), (0.4, -0.9, 0.7)),
     "cylinder": boundary.Cylinder((-0.3, 0.0, -0.4), (0.2, 0.3, 0.5), 0.45),
     "capsule": boundary.Capsule((-0.3, 0.0, -0.2), (0.2, 0.3, 0.3), 0.4),
+    "capsule, put back": boundary.Offset(
+        boundary.Capsule((-0.3, 0.0, -0.2), (0.2, 0.3, 0.3), 0.5), -0.1
+    ),
 }
 SHAPES_2D = {
     "disc": boundary.Sphere((0.1, -0.2), 0.7),
@@ -45,6 +48,7 @@ def inside(name, x):
         r = (x - np.array([0.1, 0.0, -0.1])[:d]) @ R[:d, :d]
         return np.all(np.abs(r) <= np.array([0.6, 0.4, 0.3])[:d], axis=1)
     a, b, radius = {
+        "capsule, put back": ([-0.3, 0.0, -0.2], [0.2, 0.3, 0.3], 0.4),
         "cylinder": ([-0.3, 0.0, -0.4], [0.2, 0.3, 0.5], 0.45),
         "capsule": ([-0.3, 0.0, -0.2], [0.2, 0.3, 0.3], 0.4),
         "2-D capsule": ([-0.3, 0.0], [0.2, 0.3], 0.4),

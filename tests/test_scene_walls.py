@@ -18,6 +18,7 @@ from pgjax.boundary import (
     Cylinder,
     HalfSpace,
     KeyFrames,
+    Offset,
     ParticleForce,
     ParticleImpulse,
     ParticleMotion,
@@ -42,6 +43,9 @@ WALLS = {
         (-1.0, -1, -1), (1.0, 1, 1), Slip()
     ),
     'type = "half-space"\npoint = [0, 0, -0.1]\nnormal = [0, 0, 1]': Collider(PLANE),
+    'type = "half-space"\npoint = [0, 0, -0.1]\nnormal = [0, 0, 1]\ngap = 0.6': Collider(
+        Offset(PLANE, -0.06)
+    ),
     'type = "half-space"\npoint = [0, 0, -0.1]\nnormal = [0, 0, 1]\nfriction = 0.4': Collider(
         PLANE, Separating(0.4)
     ),
@@ -52,6 +56,9 @@ WALLS = {
     'type = "sphere"\ncenter = [0, 0, -0.1]\nradius = 0.2': Collider(BALL),
     'type = "sphere"\ncenter = [0, 0, -0.1]\nradius = 0.2\ninside = true': Collider(
         Complement(BALL)
+    ),
+    'type = "sphere"\ncenter = [0, 0, -0.1]\nradius = 0.2\ninside = true\ngap = 1': Collider(
+        Offset(Complement(BALL), -0.1)
     ),
     'type = "cuboid"\ncenter = [0, 0, 0]\nhalf_size = [1, 2, 3]': Collider(
         Cuboid((0.0, 0, 0), (1.0, 2, 3))
@@ -284,6 +291,10 @@ FAULTS = [
         'type = "half-space"\npoint = [0, 0, 0]\nnormal = [0, 0, 1]\ncontact = "slip"\n'
         "friction = 1",
         "`friction` must be left out unless `contact` is separating",
+    ),
+    (
+        'type = "half-space"\npoint = [0, 0, 0]\nnormal = [0, 0, 1]\ngap = -1',
+        "`gap` must be a finite number at least 0",
     ),
     (
         'type = "half-space"\npoint = [0, 0, 0]\nnormal = [0, 0, 1]\nfriction = -1',

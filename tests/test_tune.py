@@ -74,6 +74,16 @@ def test_levels_that_do_not_converge_are_said_to():
     assert refined([motion()] * 3, RATIO).doubt == 0
 
 
+def test_two_grids_that_agree_by_chance_are_not_trusted():
+    """As a floor between nodes does it: 7 % off, then 4 % and 3.9 % off in another direction."""
+    x, error, other = motion(), noise(1, motion()), noise(2, motion())
+    levels = [x + scale(x) * e for e in (0.07 * error, -0.04 * other, -0.039 * other)]
+    limit = refined(levels, RATIO)
+    assert limit.order > 2
+    assert limit.changes[1] < 0.002
+    assert limit.error(x) < limit.doubt
+
+
 def test_scale_is_the_displacement_but_not_more_than_the_size():
     start = noise(0, np.zeros((2, 400, 3)))[1]
     size = np.sqrt(np.mean(np.sum((start - start.mean(0)) ** 2, axis=1)))

@@ -28,5 +28,6 @@ from pgjax.boundary.shapes import Complement as Complement
 from pgjax.boundary.shapes import Cuboid as Cuboid
 from pgjax.boundary.shapes import Cylinder as Cylinder
 from pgjax.boundary.shapes import HalfSpace as HalfSpace
+from pgjax.boundary.shapes import Offset as Offset
 from pgjax.boundary.shapes import SampledSDF as SampledSDF
 from pgjax.boundary.shapes import Sphere as Sphere

@@ -16,6 +16,7 @@ from pgjax.scenes.capture import body
 from pgjax.scenes.carriage import Carriage
 from pgjax.scenes.conditions import ParticlesPart
 from pgjax.scenes.crowd import Crowd, by_material
+from pgjax.scenes.floor import on_floor
 from pgjax.scenes.merging import merged
 from pgjax.scenes.model import ModelPart
 from pgjax.scenes.reader import SceneError, naming
@@ -106,7 +107,8 @@ def plan(file: SceneFile, *, ply: Path | None = None, frames: int | None = None)
             crowd, counts, carriage, note = merged(crowd, counts, file.grid)
             changes = (*changes, note)
     with naming(file.source):
-        scene = _scene(file, crowd, counts, still)
+        scene, note = _scene(file, crowd, counts, still)
+        changes = changes if note is None else (*changes, note)
         v, C = crowd.velocities()
         state = initial_state(scene, crowd.x, v, C=C)
         longest = _longest_step(file, scene, state)
@@ -159,25 +161,30 @@ def _longest_step(file: SceneFile, scene: Scene, state: State) -> float:
     return file.time.dt
 
 
-def _scene(file: SceneFile, crowd: Crowd, counts: tuple[int, ...], still: Gaussians) -> Scene:
-    """The scene of particles that are in the order of their materials."""
+def _scene(
+    file: SceneFile, crowd: Crowd, counts: tuple[int, ...], still: Gaussians
+) -> tuple[Scene, str | None]:
+    """The scene of particles in the order of their materials, and what was done to its grid."""
     ends = np.cumsum(counts)
     rows = np.split(crowd.rows, ends[:-1])
     grid = _grid(file.grid)
     site = _site(grid, still)
-    return Scene(
+    walls = [_wall(part, site) for part in file.boundaries]
+    grid, note = on_floor(grid, walls, file.gravity)
+    scene = Scene(
         grid,
         [part.of(own) for part, own in zip(file.materials, rows, strict=True)],
         crowd.volumes,
         counts=counts,
         gravity=file.gravity,
-        boundaries=[_wall(part, site) for part in file.boundaries],
+        boundaries=walls,
         particle_conditions=[_condition(part, crowd) for part in file.particle_conditions],
         spline=file.grid.spline,
         scheme=file.grid.scheme,
         grid_damping=file.grid_damping,
         shear_damping=file.shear_damping,
     )
+    return scene, note
 
 
 def _site(grid: Grid, still: Gaussians) -> Site:

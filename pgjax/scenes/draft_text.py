@@ -213,15 +213,16 @@ def _seconds(seconds: float) -> str:
 
 def _walls(choices: Choices) -> list[str]:
     inner = 2 * choices.spacing
-    where = f"A wall acts about {_AHEAD:g} spacings before its place, hence that much lower."
+    where = f"A wall acts about {_AHEAD:g} spacings before its nodes, hence the gap."
     if choices.floor > 0:
         where = f"The foot was cut off at z = {choices.floor:g}, so the floor is there. {where}"
     return [
         *_comment(f"The ground. {where}"),
         "[[boundary]]",
         'type = "half-space"',
-        f"point = [0, 0, {choices.floor - _AHEAD * choices.spacing:.3g}]",
+        f"point = [0, 0, {choices.floor:.3g}]",
         "normal = [0, 0, 1]",
+        f"gap = {_AHEAD:g}  # spacings of the grid",
         'contact = "separating"',
         "friction = 0.5",
         "",

@@ -11,6 +11,7 @@ from pgjax.boundary import (
     Box,
     Collider,
     Complement,
+    Offset,
     ParticleForce,
     ParticleImpulse,
     ParticleMotion,
@@ -143,6 +144,8 @@ def _walls(plan: Plan) -> Iterator[Mark]:
 
 def _collider(plan: Plan, wall: Collider, name: str, colour: str) -> Iterator[Mark]:
     shape, inside = wall.shape, ""
+    if isinstance(shape, Offset):
+        shape = shape.shape
     if isinstance(shape, Complement):
         shape, inside = shape.shape, "inside of a "
     kind = _SHAPES.get(type(shape).__name__, type(shape).__name__.lower())

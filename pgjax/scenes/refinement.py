@@ -62,8 +62,8 @@ def refined(levels: Sequence[np.ndarray], ratio: float) -> Limit:
     the largest of: `|Δ₂ − q Δ₁| q/(1 − q)`, what the changes do not have in common; a quarter of
     e(p), after P. J. Roache's grid convergence index, 1994; and its distance from e(1), since walls
     and free surfaces are of first order, whatever three grids show; it is all of e(p) where the
-    order is below 1/2. Where the changes do not approach anything the limit is x₂, and e(p) the
-    doubt.
+    order is below 1/2. Where the changes do not approach anything the limit is x₂, and the doubt
+    is e(p) or the larger change: that the last two agree may be by chance.
 
     Args:
         levels: at least three motions `(f, n, 3)`, coarse to fine, of the same Gaussians.
@@ -80,7 +80,7 @@ def refined(levels: Sequence[np.ndarray], ratio: float) -> Limit:
     norms = float(np.linalg.norm(first) * np.linalg.norm(second))
     coherence = float(np.sum(first * second)) / norms if norms > 0 else 0.0
     ahead, ahead_of_first_order = q / (1 - q), 1 / (ratio - 1)
-    x, doubt = x2, ahead * d2
+    x, doubt = x2, max(ahead * d2, d1)
     if order > 0 and coherence > _COHERENT:
         x = x2 + ahead * second
         least = (

@@ -20,6 +20,7 @@ from pgjax.boundary import (
     Cuboid,
     Cylinder,
     HalfSpace,
+    Offset,
     SampledSDF,
     Separating,
     Slip,
@@ -110,13 +111,14 @@ def _collider(body: Callable[[Table], Callable[[Site], _Body]]) -> Callable:
         """The wall of a table, once its site is known."""
         shaped, contact, hollow = body(t), _contact(t), t.boolean("inside", False)
         moved, belt = t.optional("motion", motion), t.vector("surface_velocity", None)
-        times = window(t)
+        times, gap = window(t), t.number("gap", 0.0, at_least=0)
 
         def make(site: Site) -> Callable:
             """The wall itself."""
             shape, center = shaped(site)
+            shape = Complement(shape) if hollow else shape
             return Collider(
-                Complement(shape) if hollow else shape,
+                Offset(shape, -gap * site.spacing) if gap else shape,
                 contact,
                 None if moved is None else moved(center),
                 surface_velocity=belt,
