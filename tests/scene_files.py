@@ -54,7 +54,7 @@ gravity = [0, 0, -9.81]
     + TWO_MATERIALS
     + """[[boundary]]
 type = "half-space"
-point = [0, 0, -0.05]
+point = [0, 0, -0.1]
 normal = [0, 0, 1]
 contact = "separating"
 friction = 0.3

@@ -96,7 +96,7 @@ def test_what_lands_does_so_at_the_same_height_on_every_grid(tmp_path):
     """
     save_ply(tmp_path / "drop.ply", ball(600))
     path = tmp_path / "drop.toml"
-    text = changed(DROP, ("point = [0, 0, -0.05]", "point = [0, 0, -0.05]\ngap = 0.6"))
+    text = changed(DROP, ("point = [0, 0, -0.1]", "point = [0, 0, -0.05]\ngap = 0.6"))
     path.write_text(changed(text, ("frames = 3", "frames = 5")))
     file = read_scene(path)
     base = own(file)

@@ -219,7 +219,7 @@ def test_a_longer_run_goes_on_from_a_shorter_one(folder, whole, tmp_path, monkey
 
 
 def test_a_lost_particle_stops_a_resumed_run_as_it_stopped_the_first(folder, tmp_path):
-    lost = planned(folder, ("point = [0, 0, -0.05]", "point = [0, 0, -9]"), frames=30)
+    lost = planned(folder, ("point = [0, 0, -0.1]", "point = [0, 0, -9]"), frames=30)
     out = tmp_path / "out"
     with pytest.raises(SimulationError, match=r"Stopped at frame \d+: OUT_OF_DOMAIN") as first:
         run_to_video(lost, out)

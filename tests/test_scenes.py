@@ -180,7 +180,7 @@ def test_two_elastic_materials_move(tmp_path):
 
 
 def test_leaving_the_grid_keeps_what_was_computed(folder, capsys):
-    path = with_change(folder, "point = [0, 0, -0.05]", "point = [0, 0, -9]")
+    path = with_change(folder, "point = [0, 0, -0.1]", "point = [0, 0, -9]")
     path.write_text(path.read_text().replace("frames = 3", "frames = 30"))
     out = folder / "lost"
     assert cli.main(["run", str(path), "--out", str(out)]) == 1

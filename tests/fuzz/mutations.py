@@ -12,8 +12,9 @@ import warnings
 from hypothesis import settings
 from hypothesis import strategies as st
 
-# What refusing a file may take: seconds of computing, which tracing memory doubles, and bytes.
-SECONDS, BYTES = 3.0, 64 << 20
+# What refusing a file may take: seconds of computing, which tracing memory makes six times as long,
+# and bytes.
+SECONDS, BYTES = 12.0, 64 << 20
 
 
 def fuzz(examples):
