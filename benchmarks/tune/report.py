@@ -45,42 +45,15 @@ def write(path: Path, rows: list[dict]) -> None:
         f"finer than all that were looked at for it. Errors are the largest over the frames of the "
         f"root mean square over the Gaussians, in the scale of the scene "
         f"([what that is](../../docs/choosing-step-and-spacing.md)); times are of the simulation "
-        f"alone, without pictures, those of a row measured side by side. Scenes that were not "
-        f"run at that date have the rows of an earlier run, on another machine; microphone and jam "
-        f"are from before led particles led their nodes. The demand: the true error "
-        f"is at most twice what was asked.",
+        f"alone, without pictures, those of a row measured side by side; scenes may have been run "
+        f"one by one, on machines of different speed. The demand: the true error is at most twice "
+        f"what was asked.",
         "",
         "| scene | frames | asked | chosen | predicted | in doubt by | true | against | met | "
         "ms a frame | its own | true error of its own | times as fast |",
         "|---|---:|---:|---|---:|---:|---:|---|---|---:|---:|---:|---:|",
     ]
-    for row in rows:
-        cells = [row["scene"], str(row["frames"]), _percent(row["asked"])]
-        if row["setting"] is None:
-            cells += [
-                "nothing: see below",
-                "",
-                _percent(row["doubt"]),
-                "",
-                row["reference"],
-                "",
-                "",
-            ]
-            cells += [f"{1e3 * row['own_seconds']:.1f}", _percent(row["own_true"]), ""]
-        else:
-            cells += [
-                row["setting"],
-                _percent(row["predicted"]),
-                _percent(row["doubt"]),
-                _percent(row["true"]),
-                row["reference"],
-                "yes" if row["true"] <= 2 * row["asked"] else "**no**",
-                f"{1e3 * row['seconds']:.1f}",
-                f"{1e3 * row['own_seconds']:.1f}",
-                _percent(row["own_true"]),
-                f"{row['own_seconds'] / row['seconds']:.3g}",
-            ]
-        lines.append("| " + " | ".join(cells) + " |")
+    lines += [_summary(row) for row in rows]
     said = [
         f"- {row['scene']}, {_percent(row['asked'])}: {t}" for row in rows for t in row["notes"]
     ]
@@ -93,6 +66,24 @@ def write(path: Path, rows: list[dict]) -> None:
             lines += ["|---|---|---:|---:|---:|---:|"]
             lines += [_cells(run) for run in row["table"]]
     path.with_suffix(".md").write_text("\n".join(lines) + "\n")
+
+
+def _summary(row: dict) -> str:
+    cells = [row["scene"], str(row["frames"]), _percent(row["asked"])]
+    own = [f"{1e3 * row['own_seconds']:.1f}", _percent(row["own_true"])]
+    if row["setting"] is None:
+        cells += ["nothing: see below", "", _percent(row["doubt"]), "", row["reference"], "", ""]
+        return "| " + " | ".join([*cells, *own, ""]) + " |"
+    cells += [
+        row["setting"],
+        *map(_percent, (row["predicted"], row["doubt"], row["true"])),
+        row["reference"],
+        "yes" if row["true"] <= 2 * row["asked"] else "**no**",
+        f"{1e3 * row['seconds']:.1f}",
+        *own,
+        f"{row['own_seconds'] / row['seconds']:.3g}",
+    ]
+    return "| " + " | ".join(cells) + " |"
 
 
 def _cells(run: dict) -> str:
