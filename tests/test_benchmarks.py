@@ -59,6 +59,7 @@ def numbers_of(table):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_quick_render_tables_are_whole():
     times, memory = (

@@ -192,7 +192,7 @@ def test_motions_rest_outside_their_window():
 
 
 @double
-@pytest.mark.parametrize("name", ["steady", "steady 2-D"])
+@pytest.mark.parametrize("name", [pytest.param("steady", marks=pytest.mark.slow), "steady 2-D"])
 def test_steps_follow_a_steady_motion_to_rounding(name):
     """200 steps of 4 ms along a circle: no drift, where v = ω × r would spiral out by 0.1 %."""
     motion, dt = MOTIONS[name], jnp.asarray(0.004)

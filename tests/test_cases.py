@@ -149,6 +149,7 @@ def test_fit_from_pictures(recorded, tmp_path, capsys):
     assert cli.main(["fit", str(case), "--out", str(out)]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_fit_from_a_track(recorded, tmp_path):
     case = write(recorded, "track.toml", data='[track]\nfile = "track.npz"\n')

@@ -68,6 +68,7 @@ def test_the_motion_is_the_same(monkeypatch, name, walls):
     assert not np.array_equal(part.x[0], part.x[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_derivatives_and_batches_are_the_same(monkeypatch):
     scene, state = scene_of(MATERIALS["sand"], "friction")

@@ -203,6 +203,7 @@ def scene_of(d, mapping=None):
     return scene, pgjax.initial_state(scene, x, 0.3 * rng.normal(size=(n, d)) - 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 @pytest.mark.parametrize(
     "mapping", [pytest.param(None, marks=pytest.mark.slow), models.DruckerPrager(30.0)]

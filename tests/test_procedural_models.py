@@ -18,6 +18,15 @@ from pgjax.scenes.procedural.solids import Places, Solid, filled, plain
 LOOSE = {"sofa-suite": 4, "materials": 4, "can": 3, "jam": 2, "ruins": 9, "cake": 2}
 
 
+# To plan these takes more than eight seconds each.
+LARGE = ("ruins", "cake", "vasedeck", "can", "sofa-suite", "fox", "wolf", "bread", "toast")
+
+
+def some(names, slow):
+    """Names of tests, of which some are slow."""
+    return [pytest.param(n, marks=pytest.mark.slow) if n in slow else n for n in names]
+
+
 @functools.cache
 def planned(name):
     return plan(read_scene(resolve(name)))
@@ -28,7 +37,7 @@ def test_every_scene_has_a_model_of_its_name():
     assert len(MODELS) == 14
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", some(MODELS, LARGE))
 def test_a_model_is_whole(name):
     made = planned(name)
     model = concatenate([made.moving, made.still])
@@ -167,6 +176,7 @@ def test_the_first_solid_owns_what_is_shared():
     assert not is_red[x[:, 0] > 0.22].any()
 
 
+@pytest.mark.slow
 def test_every_preset_takes_a_capture(tmp_path):
     path = tmp_path / "ball.ply"
     save_ply(path, ball(400))

@@ -22,7 +22,10 @@ def gap(ours, theirs):
 
 
 @pytest.mark.float64
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize(
+    "name",
+    [n if n == "DruckerPragerSVD" else pytest.param(n, marks=pytest.mark.slow) for n in PAIRS],
+)
 def test_response_and_derivative_are_those_of_the_fast_law(name):
     law, H = LAWS[name], laws.strains()
     for history in (laws.start(law, len(H)), laws.later(law, len(H))):

@@ -97,6 +97,7 @@ def test_large_images_match_the_oracle():
     assert_matches_oracle(hard_scene(7), camera)
 
 
+@pytest.mark.slow
 def test_runs_longer_than_an_item_and_a_batch_change_nothing(monkeypatch):
     """In plain JAX, whose lists are cut into pieces."""
     scene, camera = hard_scene(3), looking(45, 33)

@@ -53,6 +53,7 @@ def total(scene, velocity, times, checkpoint):
     return jax.lax.scan(add, jnp.zeros((), times.dtype), times)[0]
 
 
+@pytest.mark.slow
 def test_frames_in_a_loop_are_the_frames_one_by_one():
     scene, velocity, times = hard_scene(0), floats([0.1, -0.2, 0.3]), floats([0.0, 0.3, 0.6])
     losses = jax.jit(lambda v: jax.lax.map(lambda t: frame_loss(scene, v, t), times))(velocity)

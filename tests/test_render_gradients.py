@@ -119,8 +119,15 @@ def frozen(gaussians, point, rule, antialiased=False):
 
 
 @pytest.mark.float64
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("rule", [SMOOTH, WITHOUT_CUTOFF], ids=["smooth", "without cutoff"])
+@pytest.mark.parametrize(
+    ("rule", "antialiased"),
+    [
+        pytest.param(SMOOTH, True, id="smooth, antialiased"),
+        pytest.param(SMOOTH, False, id="smooth", marks=pytest.mark.slow),
+        pytest.param(WITHOUT_CUTOFF, True, id="no cutoff, antialiased", marks=pytest.mark.slow),
+        pytest.param(WITHOUT_CUTOFF, False, id="no cutoff", marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_match_finite_differences(rule, antialiased):
     for seed in range(2):
         gaussians, point, direction = parameters(seed)
@@ -147,7 +154,7 @@ def test_derivatives_match_finite_differences(rule, antialiased):
 
 @pytest.mark.float64
 @pytest.mark.parametrize("rule", [RULE_3DGS, RULE_EXACT, SMOOTH], ids=["3dgs", "exact", "smooth"])
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("antialiased", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_forward_and_reverse_mode_agree(rule, antialiased):
     """In every output, also where finite differences do not converge."""
     for seed in range(2):
@@ -223,6 +230,7 @@ def test_a_clamped_alpha_and_an_empty_pixel_have_no_derivative():
     assert rate[4, 5] > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_second_derivatives():
     """Through the plain functions."""

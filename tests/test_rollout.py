@@ -86,6 +86,7 @@ def kept(states):
     return jax.tree.map(lambda *a: jnp.stack(a), *[pgjax.Kinematics(s.x, s.v, s.F) for s in states])
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_jit_scan_and_loop_are_one(measure):
     """V44. Entry 0 of what is saved is the initial state; a restart changes no bit."""
@@ -225,7 +226,13 @@ def test_any_number_of_frames_and_substeps(frames, substeps, measure):
     measure("V44", f"scan = loop, {frames} x {substeps} steps", gap, below=1e-13)
 
 
-@pytest.mark.parametrize("substeps", [None, 8], ids=["one-frame", "many-frames"])
+@pytest.mark.parametrize(
+    "substeps",
+    [
+        pytest.param(None, id="one-frame", marks=pytest.mark.slow),
+        pytest.param(8, id="many-frames"),
+    ],
+)
 def test_reverse_mode_memory_grows_as_the_root(substeps, measure):
     """2√T + 60 states for T steps, in one long frame and in many short ones."""
     scene, state = one_body(n=400)

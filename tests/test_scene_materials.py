@@ -174,7 +174,13 @@ EVERYWHERE = [
 ]
 
 
-@pytest.mark.parametrize(("law", "line", "get"), EVERYWHERE)
+@pytest.mark.parametrize(
+    ("law", "line", "get"),
+    [
+        e if i % 3 == 0 else pytest.param(*e, marks=pytest.mark.slow)
+        for i, e in enumerate(EVERYWHERE)
+    ],
+)
 def test_every_parameter_may_be_a_file(tmp_path, law, line, get):
     """And a step of the simulation takes it."""
     values = np.linspace(0.2, 0.4, 200)

@@ -49,8 +49,8 @@ def assert_same(image, expected):
     ("native", "rule", "antialiased"),
     [
         ("1", RULE_3DGS, False),
-        ("1", RULE_EXACT, True),
-        ("1", Rule(smooth=True), False),
+        pytest.param("1", RULE_EXACT, True, marks=pytest.mark.slow),
+        pytest.param("1", Rule(smooth=True), False, marks=pytest.mark.slow),
         ("0", RULE_3DGS, True),
     ],
 )
@@ -110,6 +110,7 @@ def loss(image):
     return jnp.sum((image.rgb - target) ** 2) + jnp.sum(image.depth)
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_derivatives_are_those_of_all_together():
     """Of what moves, of what stands still where it is prepared inside, and forward as reverse."""

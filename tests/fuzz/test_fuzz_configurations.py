@@ -175,7 +175,7 @@ def test_odd_captures_are_looked_at_or_refused(capture):
         assert np.isfinite([*found.lower, *found.upper, found.foot]).all()
 
 
-@fuzz(8)
+@fuzz(4)
 @given(capture=captures())
 def test_odd_captures_become_scenes_or_are_refused(folder, capture):
     path = folder / "odd.ply"
