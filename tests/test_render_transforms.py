@@ -300,6 +300,7 @@ def test_too_small_a_capacity_is_seen(monkeypatch):
     scene, camera = hard_scene(0), looking(45, 33)
     whole = render(scene, camera)
     assert np.all(np.isfinite(whole.rgb))
+    # Native code takes fewer pairs: those that are not seen.
     needed = int(whole.pairs)
     monkeypatch.setenv("PGJAX_NATIVE", "0")
     jax.clear_caches()
@@ -310,7 +311,7 @@ def test_too_small_a_capacity_is_seen(monkeypatch):
 
     (_, short), bar = jax.jit(jax.value_and_grad(loss, has_aux=True))(scene.means)
     assert np.all(np.isnan(short.rgb))
-    assert short.pairs == needed
+    assert needed <= short.pairs < 1.1 * needed
     assert np.any(np.isnan(bar))
     jax.clear_caches()
 
