@@ -239,6 +239,7 @@ def test_bad_motions_are_refused():
 # --- Colliders -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @double
 def test_contact_is_relative_to_the_moving_body():
     """A node seen from a turning, moving body: the same contact as on the body at rest."""

@@ -106,6 +106,7 @@ def test_two_rotations_are_joined_along_the_shortest_way():
     np.testing.assert_allclose((b * middle.inv()).magnitude(), whole / 2, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_level_path_never_rolls():
     level, free = CameraPath(TIMES, level_keys(), up=UP), CameraPath(TIMES, level_keys())
     t = jnp.linspace(0, 4, 401, dtype=jnp.zeros(()).dtype)

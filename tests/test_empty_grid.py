@@ -52,7 +52,12 @@ def whole_and_part(monkeypatch, run):
 
 
 @pytest.mark.parametrize(
-    ("name", "walls"), [("neo-Hookean", "none"), ("sand", "friction"), ("dev/vol", "slip")]
+    ("name", "walls"),
+    [
+        ("sand", "friction"),
+        pytest.param("neo-Hookean", "none", marks=pytest.mark.slow),
+        pytest.param("dev/vol", "slip", marks=pytest.mark.slow),
+    ],
 )
 def test_the_motion_is_the_same(monkeypatch, name, walls):
     scene, state = scene_of(MATERIALS[name], walls)

@@ -77,7 +77,13 @@ TURNS = {
 }
 
 
-@pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
+@pytest.mark.parametrize(
+    "turn",
+    [
+        pytest.param(turn, id=name, marks=() if "tilted" in name else pytest.mark.slow)
+        for name, turn in TURNS.items()
+    ],
+)
 def test_up_ground_and_object_are_found(turn):
     gaussians, ball = capture(turn)
     found = inspect(gaussians)
@@ -104,6 +110,7 @@ def test_what_hovers_has_its_height_over_the_ground():
     assert found.clearance == pytest.approx(0.25, abs=0.02)
 
 
+@pytest.mark.slow
 def test_what_stands_on_the_ground_has_its_floor_where_it_was_cut_off():
     for hover in (0, 0.25):
         gaussians, _ = capture(hover=hover)
@@ -157,6 +164,7 @@ def test_the_same_capture_gives_the_same_file(drafted):
     assert draft(drafted.parent.parent / "ball one.ply", drafted).text == drafted.read_text()
 
 
+@pytest.mark.slow
 def test_the_file_runs(drafted, tmp_path):
     small = drafted.with_name("small.toml")
     small.write_text(drafted.read_text().replace("fov = 40", "fov = 40\nwidth = 48\nheight = 48"))

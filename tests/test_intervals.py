@@ -25,6 +25,7 @@ def _flight(frames=12):
     return problem, np.asarray(data)
 
 
+@pytest.mark.slow
 @float64
 def test_errors_shared_by_a_frame_widen(measure):
     """Each frame is shifted as a whole: by least squares v is off by σ/√Σt², whatever is seen."""
@@ -88,6 +89,7 @@ def test_moments_of_several_observations():
     np.testing.assert_array_equal(twice, np.concatenate([expected, expected + 4]))
 
 
+@pytest.mark.slow
 @float64
 def test_what_is_kept_is_not_bent(measure):
     """A model that is wrong after the contact moves v₀ of a joint fit, and not of a kept one."""

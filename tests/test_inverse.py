@@ -230,6 +230,7 @@ def test_recovers_a_yield_stress():
     assert all(trial.taken or trial.note for trial in found.trials)
 
 
+@pytest.mark.slow
 @float64
 def test_lost_particles_are_rejected():
     """A first guess that throws the body out of the grid fails by name; a later trial is undone."""
@@ -316,6 +317,7 @@ def test_bounded_steps_lower_the_model():
     assert _promised(point, step) > 0
 
 
+@pytest.mark.slow
 @float64
 def test_profile_agrees_with_the_interval():
     unknowns = parameters(nu=Parameter(0.3, fixed=True))
@@ -332,6 +334,7 @@ def test_profile_agrees_with_the_interval():
     assert (ends > 0.6 * rise).all()
 
 
+@pytest.mark.slow
 @float64
 def test_more_views_help():
     problem = elastic_problem(frames=6, noise=2e-3)

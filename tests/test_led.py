@@ -82,6 +82,7 @@ def test_held_particles_are_a_sticky_wall():
     assert np.abs(held[30:]).min() < 0.15 * np.abs(held).max()
 
 
+@pytest.mark.slow
 def test_nothing_creeps_at_a_longer_step():
     """A dashpot would give way in proportion to Δt."""
     scene, state = beam(4)
@@ -119,6 +120,7 @@ def test_once_let_go_it_falls_freely():
     np.testing.assert_allclose(made.saved.v[2, :, 1], -G * let_go, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_derivatives_through_led_nodes():
     """Forward, reverse and differences agree, of stiffness and of the speed of what leads.

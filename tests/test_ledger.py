@@ -142,7 +142,11 @@ def test_damping_takes_what_it_should():
 
 @pytest.mark.float64
 @pytest.mark.parametrize(
-    "plasticity", [models.VonMises(400.0), models.HerschelBulkley(500.0, 20.0)], ids=["VM", "HB"]
+    "plasticity",
+    [
+        pytest.param(models.VonMises(400.0), id="VM"),
+        pytest.param(models.HerschelBulkley(500.0, 20.0), id="HB", marks=pytest.mark.slow),
+    ],
 )
 def test_plastic_flow_takes_the_rest(measure, plasticity):
     """Sheared in free space: what motion and stress lose, flow takes, and with Δt → 0 all of it."""
@@ -181,6 +185,7 @@ def test_what_is_lost_does_not_count():
     np.testing.assert_allclose(ledger.cfl[0], 1e-3 * 2.0 * 12, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_is_differentiable_and_batched():
     scene, state = falling()

@@ -64,6 +64,7 @@ def test_frames_in_a_loop_are_the_frames_one_by_one():
     np.testing.assert_allclose(slope, plain, rtol=1e-8 if DOUBLE else 1e-2)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_bounds_what_reverse_mode_remembers():
     scene, velocity = hard_scene(0), floats([0.1, -0.2, 0.3])
 

@@ -474,6 +474,7 @@ def wait_for_frame(process, out, frame):
     raise AssertionError("the run did not come to its first frames")
 
 
+@pytest.mark.slow
 def test_a_killed_process(folder, whole, tmp_path):
     with started(folder, tmp_path / "out") as (process, _):
         process.kill()

@@ -51,7 +51,7 @@ def assert_same(image, expected):
         ("1", RULE_3DGS, False),
         pytest.param("1", RULE_EXACT, True, marks=pytest.mark.slow),
         pytest.param("1", Rule(smooth=True), False, marks=pytest.mark.slow),
-        ("0", RULE_3DGS, True),
+        pytest.param("0", RULE_3DGS, True, marks=pytest.mark.slow),
     ],
 )
 def test_the_picture_is_that_of_all_together(monkeypatch, rule, antialiased, native):

@@ -95,6 +95,7 @@ def test_a_member_that_cannot_be_simulated_is_a_row(table):
     assert table.reasons() == [("Argument `nu` must be below 0.5, but is 0.5.", 2)]
 
 
+@pytest.mark.slow
 def test_the_grouping_does_not_matter_at_one_time_step(table):
     dt = float(np.nanmin(table["dt"]))
     vary = {"E": [1e4, 1e5], "nu": [0.1, 0.3]}

@@ -113,7 +113,15 @@ def test_error_of_every_node(d, degree, slope):
     assert jnp.any(magnitude == 0)  # nodes that no particle reaches
 
 
-@KINDS
+@pytest.mark.parametrize(
+    ("d", "degree", "slope"),
+    [
+        (2, 3, False),
+        (3, 2, True),
+        pytest.param(2, 2, True, marks=pytest.mark.slow),
+        pytest.param(3, 3, False, marks=pytest.mark.slow),
+    ],
+)
 def test_forward_and_reverse_mode(d, degree, slope):
     case = Case(d, degree, slope)
     sent, received = (case.xi, *case.payload), (case.xi, case.g)
@@ -179,6 +187,7 @@ def energy(case, of):
     return one
 
 
+@pytest.mark.slow
 def test_batches():
     """vmap of each operand alone or all together, nested, of gradients, under gradients."""
     case, n = Case(3, 2, True), 3
@@ -232,6 +241,7 @@ def test_tangents_share_their_primal():
     assert f"tensor<1x{case.xi.shape[0]}x3x" in text  # positions, once
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_second_order_and_rematerialisation():
     case = Case(2, 3, True, particles=8)

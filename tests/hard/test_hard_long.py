@@ -168,6 +168,7 @@ def test_h50_derivative_through_a_thousand_steps(name, holds):
 # --- Compiled once --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_h55_scenes_of_several_sizes_in_turn(holds):
     """Each size compiles once; going back to the first gives its bits again."""
     traced = []
