@@ -17,7 +17,7 @@ from pgjax.render import load_cameras, load_gaussians, load_image, load_video
 from pgjax.scenes import SceneError, read_scene
 from pgjax.storage import load_trajectory
 
-WALL = 'type = "half-space"\npoint = [0, 0, -0.05]\nnormal = [0, 0, 1]'
+WALL = 'type = "half-space"\npoint = [0, 0, -0.1]\nnormal = [0, 0, 1]'
 
 
 @pytest.fixture(scope="module")
