@@ -275,6 +275,7 @@ def throw(friction, speed, spin, center, *, fall=0.02):
     return jnp.concatenate([jnp.mean(end.x, axis=0), jnp.mean(end.v, axis=0)])
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_parameters_of_colliders(measure):
     """Forward = reverse = central differences, for friction, velocity, spin and place.
 

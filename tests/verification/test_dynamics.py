@@ -347,7 +347,13 @@ def frames_differ(material):
     return [np.linalg.norm(a) / np.linalg.norm(still) for a in (coarse, fine, 2 * fine - coarse)]
 
 
-@pytest.mark.parametrize("what", MOVED)
+@pytest.mark.parametrize(
+    "what",
+    [
+        pytest.param(what, marks=pytest.mark.slow) if what in ("paste", "metal") else what
+        for what in MOVED
+    ],
+)
 def test_v39_frame_indifference(measure, what):
     coarse, fine, limit = frames_differ(MOVED[what])
     measure("V39", f"order of the error of a turned frame, {what}", order(coarse, fine), **FIRST)
@@ -365,6 +371,7 @@ def test_v39_exact_stress(measure):
     measure("V39", "order of the error of the stress, neo-Hookean", order(*errors), **FIRST)
 
 
+@pytest.mark.slow
 def test_v39_fails_with_a_small_strain_law(measure):
     coarse, fine, limit = frames_differ(pm.Material(SmallStrain(1e4, NU)))
     measure("V39", "negative control: small strains, order", order(coarse, fine), below=0.5)

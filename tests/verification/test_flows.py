@@ -132,6 +132,7 @@ def ritter(measure, n):
         measure("V38", f"error of depth/H, {case}", error, within=(-0.07, 0.07))
 
 
+@pytest.mark.slow
 def test_v38_dam_break(measure):
     """Ritter: the front runs at `2 √(gH)`, the depth is `H (2 − x/(√(gH) t))²/9`.
 
@@ -212,7 +213,7 @@ def test_v37_stands(measure):
     measure("V37", "slump in cells, T = 0.5, R = 4 cells", slump * 8, within=(-1.0, 1.0))
 
 
-@pytest.mark.parametrize(("T", "n"), [(0.2, 4), slow(0.1, 4), slow(0.3, 6)])
+@pytest.mark.parametrize(("T", "n"), [slow(0.2, 4), slow(0.1, 4), slow(0.3, 6)])
 def test_v37_smooth_ground(measure, T, n):
     """On smooth ground the same argument holds with σ_Y in place of 2 τ_y, which is 15 % less."""
     slump = flows.slump(n, shear_yield(T), Slip())
@@ -224,6 +225,7 @@ def test_v37_smooth_ground(measure, T, n):
         measure("V37", f"negative control: smooth ground, T = {T}", wrong, above=1.15)
 
 
+@pytest.mark.slow
 def test_v37_fails_for_another_yield_stress(measure):
     """Negative control: τ_y taken for σ_Y."""
     ratio = flows.slump(4, 0.2, Sticky()) / pashias(0.2)
