@@ -7,8 +7,7 @@ import pathlib
 import re
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Tests spend most of their time compiling: optimise little, and keep what was compiled.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+# Tests spend most of their time compiling: keep what was compiled between runs.
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache")
 )
