@@ -88,7 +88,8 @@ def test_frames_and_steps(public, name):
     # Moved down only, by less than a spacing, where a floor is between nodes.
     np.testing.assert_array_equal(grid.origin[:2], 0)
     assert -float(grid.h) < float(grid.origin[2]) <= 0
-    assert tuple(grid.shape) == 3 * (config["n_grid"],)
+    layer = int(float(grid.origin[2]) < 0)
+    assert tuple(grid.shape) == (config["n_grid"], config["n_grid"], config["n_grid"] + layer)
 
 
 def test_written_scene_is_what_runs(public, tmp_path):
