@@ -91,8 +91,8 @@ def test_a_plan_says_that_its_grid_was_moved(tmp_path):
 def test_what_lands_does_so_at_the_same_height_on_every_grid(tmp_path):
     """A ball is dropped on a floor with a gap: the height of its centre, 0.2 s later.
 
-    It was 0.6 mm apart where nodes are on the floor; 8.7 mm with the grid as it is in the file,
-    16 mm without a gap.
+    It was 0.3 mm apart where nodes are on the floor; 10 mm with the grid as it is in the file,
+    8 mm without a gap.
     """
     save_ply(tmp_path / "drop.ply", ball(600))
     path = tmp_path / "drop.toml"

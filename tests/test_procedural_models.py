@@ -18,7 +18,7 @@ from pgjax.scenes.procedural.solids import Places, Solid, filled, plain
 LOOSE = {"sofa-suite": 4, "materials": 4, "can": 3, "jam": 2, "ruins": 9, "cake": 2}
 
 
-# To plan these takes more than eight seconds each.
+# Left to `pytest -m slow` for the time that planning them takes.
 LARGE = ("ruins", "cake", "vasedeck", "can", "sofa-suite", "fox", "wolf", "bread", "toast")
 
 
