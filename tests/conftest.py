@@ -43,6 +43,26 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.hard)
         if FLOAT32 and item.get_closest_marker("float64"):
             item.add_marker(pytest.mark.skip(reason="needs double precision"))
+    spare_variants(items)
+
+
+def spare_variants(items):
+    """Mark as slow what `pytest -m slow` and `python -m benchmarks.verification` run anyway.
+
+    Of the variants of a verification case the first stays; of hard cases all stay in single
+    precision and the first in double, of other tests the first in single and all in double.
+    That a wrong model fails is not asked every day.
+    """
+    seen = set()
+    for item in items:
+        folder, case = item.path.parent.name, item.nodeid.partition("[")[0]
+        if folder != "verification" and (folder == "hard") == FLOAT32:
+            continue
+        if item.get_closest_marker("slow") or item.get_closest_marker("skip"):
+            continue
+        if case in seen or "_fails_" in case:
+            item.add_marker(pytest.mark.slow)
+        seen.add(case)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -123,6 +123,7 @@ def write(folder, name="case.toml", *, start=1e4, data=VIEW, extra=""):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_fit_from_pictures(recorded, tmp_path, capsys):
     """From a folder of pictures to a report, and a scene file that runs."""

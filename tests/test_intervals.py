@@ -55,6 +55,7 @@ def test_errors_shared_by_a_frame_widen(measure):
     )
 
 
+@pytest.mark.slow
 @float64
 def test_independent_noise_is_left_as_it_is():
     problem, data = _flight()

@@ -347,6 +347,7 @@ def test_more_views_help():
     assert (expected["a longer film"] < expected["one more particle"]).all()
 
 
+@pytest.mark.slow
 @float64
 def test_first_order_descent_reaches_it_too():
     unknowns = parameters(nu=Parameter(0.3, fixed=True), v0=Parameter(TRUTH["v0"], fixed=True))

@@ -57,6 +57,7 @@ def test_recovers_what_is_common_and_what_is_not(measure):
         measure("identification", f"{name}, two throws, relative error", error, below=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.float64
 def test_two_throws_say_more_than_one():
     parts = [throw("v_one", noise=2e-3, seed=1), throw("v_two", noise=2e-3, seed=2)]

@@ -21,7 +21,7 @@ needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ co
 
 @pytest.mark.float64
 @needs_compiler
-@pytest.mark.parametrize("name", ["check", "check_exchange"])
+@pytest.mark.parametrize("name", ["check", pytest.param("check_exchange", marks=pytest.mark.slow)])
 def test_kernels_outside_of_jax(tmp_path, name):
     """Equal bit by bit with 1, 2, 3 and 8 threads; particles outside and NaN take no part."""
     program = tmp_path / name

@@ -43,7 +43,9 @@ def after(scene, state, v):
     return pgjax.step(scene, pgjax.initial_state(scene, state.x, v), 2e-4).v
 
 
-@pytest.mark.parametrize(("d", "periodic"), [(3, True), (2, False)])
+@pytest.mark.parametrize(
+    ("d", "periodic"), [pytest.param(3, True, marks=pytest.mark.slow), (2, False)]
+)
 def test_slabs_change_nothing(monkeypatch, d, periodic):
     """Velocities and derivatives are those of one sweep over all nodes."""
     scene, state = scene_and_state(d, periodic)
@@ -66,6 +68,7 @@ def test_slabs_change_nothing(monkeypatch, d, periodic):
     np.testing.assert_allclose(bar, bar_everywhere, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_batch_of_worlds_in_different_places():
     """Under `vmap` a branch becomes a selection: each member as alone."""
     scene, state = scene_and_state(3)
@@ -80,6 +83,7 @@ def test_a_batch_of_worlds_in_different_places():
     np.testing.assert_allclose(together, alone, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_inside_shard_map():
     """A step of each member of a sharded batch, and the derivative through it."""
     scene, state = scene_and_state(3)

@@ -81,8 +81,9 @@ def test_it_ends_in_its_claim(source):
 @each_notebook
 def test_it_runs(source, tmp_path, monkeypatch):
     monkeypatch.setenv("PGJAX_FAST", "1")
-    # Notebooks run as their readers run them: in single precision, with no check of types.
-    for name in ("JAX_ENABLE_X64", "PGJAX_TEST_FLOAT32"):
+    # Notebooks run as their readers run them: in single precision, with no check of types, and
+    # optimised.
+    for name in ("JAX_ENABLE_X64", "PGJAX_TEST_FLOAT32", "XLA_FLAGS"):
         monkeypatch.delenv(name, raising=False)
     started = children_seconds()
     client = NotebookClient(

@@ -85,8 +85,8 @@ def pictured(channel, views=1, frames=4, unknowns=None):
 @pytest.mark.parametrize(
     ("channel", "views"),
     [
-        ("rgb", 2),
-        pytest.param("silhouette", 1, marks=pytest.mark.slow),
+        ("silhouette", 1),
+        pytest.param("rgb", 2, marks=pytest.mark.slow),
         pytest.param("depth", 1, marks=pytest.mark.slow),
     ],
 )
@@ -268,6 +268,7 @@ class Learned(models.AbstractElasticity):
         return jax.grad(self.energy_of)(eps)
 
 
+@pytest.mark.slow
 @float64
 def test_a_network_as_a_law():
     """Gradients with respect to its weights through 200 steps, and a descent that uses them."""

@@ -56,18 +56,16 @@ DTYPES = ["float32", pytest.param("float64", marks=pytest.mark.float64)]
     "make",
     [
         pytest.param(lambda: scene_of(), id="elastic, 2-D"),
-        pytest.param(
-            lambda: scene_of([METAL, JELLY], counts=(6, 4)),
-            id="history and none, 2-D",
-            marks=pytest.mark.slow,
-        ),
+        pytest.param(lambda: scene_of([METAL, JELLY], counts=(6, 4)), id="history and none, 2-D"),
         pytest.param(
             lambda: scene_of([SAND, METAL], d=3, counts=(4, 6)),
             id="flowing, 3-D",
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            lambda: scene_of([METAL, JELLY], d=3, counts=(6, 4)), id="history and none, 3-D"
+            lambda: scene_of([METAL, JELLY], d=3, counts=(6, 4)),
+            id="history and none, 3-D",
+            marks=pytest.mark.slow,
         ),
     ],
 )

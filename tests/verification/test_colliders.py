@@ -114,6 +114,7 @@ def fall_into_bowl(fraction, contact):
     return np.linalg.norm(velocity[i]) / np.sqrt(2 * G * (place[0, 1] - place[i, 1]))
 
 
+@pytest.mark.slow
 def test_v31_bowl(measure):
     fine = fall_into_bowl(0.1, Slip())
     coarse = fall_into_bowl(0.2, Separating(0.0))

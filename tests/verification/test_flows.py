@@ -193,6 +193,7 @@ def shear_yield(T):
     return 3**0.5 * T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("T", "n"), [(0.2, 4), slow(0.1, 6), slow(0.2, 8), slow(0.3, 8)])
 def test_v37_slump(measure, T, n):
     """A cylinder as high as wide on rough ground, against the theory of Pashias et al. (1996).
@@ -207,6 +208,7 @@ def test_v37_slump(measure, T, n):
     measure("V37", f"slump over theory, T = {T}, R = {n} cells", ratio, within=(0.85, 1.15))
 
 
+@pytest.mark.slow
 def test_v37_stands(measure):
     """From T = 0.5 on the cylinder stands, but for 1 % of elastic settlement."""
     slump = flows.slump(4, shear_yield(0.5), Sticky())

@@ -130,6 +130,7 @@ def along(gradient, tangent):
     return sum(a.reshape(impact.COUNT, -1).sum(axis=1) for a in product.values()) + own, gravity
 
 
+@pytest.mark.slow
 def test_impact_has_every_state(measure):
     """Free flight, contact, sliding, sticking, flow, tip; the blocks never meet."""
     p, dt = base()
@@ -176,6 +177,7 @@ def test_forward_reverse_and_differences_agree(measure, capsys):
     measure("G3", "part of the derivatives without a flip", counted / possible, above=0.95)
 
 
+@pytest.mark.slow
 def test_taylor_remainder(measure):
     """G2 over 50 steps: `|x(θ + s d) − x(θ) − s x′d|` falls as s²."""
     p, dt = base()
