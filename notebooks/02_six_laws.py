@@ -249,7 +249,7 @@ def fall(material):
     return pgjax.simulate(scene, state, dt=dt, frames=frames, substeps=round(1 / fps / dt))
 
 
-falling = ["neo-Hookean", "Drucker–Prager", "von Mises"] if FAST else list(laws)
+falling = ["neo-Hookean", "von Mises"] if FAST else list(laws)
 motions = {name: fall(laws[name]) for name in falling}
 
 # %%

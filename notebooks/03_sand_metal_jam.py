@@ -143,7 +143,7 @@ print(f"jam  : {moved['jam'].sum()} of 60 flow, and keep {half_way[moved['jam']]
 def steady(h, rate):
     """Shear stress of the paste after a shear of 1 at this rate, Pa."""
     law, flow = models.DevVolNeoHookean(1e6, nu), models.HerschelBulkley(100.0, 20.0, h)
-    steps = 1000
+    steps = 300 if FAST else 1000
     L = jnp.zeros((3, 3)).at[0, 1].set(rate)
     dt = 1 / rate / steps
 
@@ -192,11 +192,12 @@ def run(material_of, values, x, volumes, grid, boundaries, seconds, frames, **fo
     substeps = round(seconds / frames / dt)
 
     def motion(value):
-        return pgjax.simulate(scene(value), state, dt=dt, frames=frames, substeps=substeps)
+        run = pgjax.simulate(scene(value), state, dt=dt, frames=frames, substeps=substeps)
+        return run.t, run.saved.x, run.final.alive  # the less is kept, the faster it compiles
 
-    motions = jax.jit(jax.vmap(motion))(jnp.asarray(values))
-    assert bool(motions.status.ok.all())
-    return np.asarray(motions.t)[0], np.asarray(motions.saved.x)
+    t, x, alive = jax.jit(jax.vmap(motion))(jnp.asarray(values))
+    assert bool(alive.all())
+    return np.asarray(t)[0], np.asarray(x)
 
 
 width = 0.2  # m
@@ -254,7 +255,7 @@ plt.show()
 
 # %%
 length, thickness = 0.3, 0.06  # m
-h = thickness / (3 if FAST else 4)
+h = thickness / (2 if FAST else 4)
 bar, areas = sampling.block((-3 * h, 0), (length, thickness), spacing=h / 2)
 
 
@@ -297,7 +298,7 @@ plt.show()
 # takes: the two thick ones are still creeping when the film ends.
 
 # %%
-h = width / (8 if FAST else 12)
+h = width / (6 if FAST else 12)
 dollop, areas = sampling.block((0, 0), (width, width), spacing=h / 2)
 recipes = np.array([[150.0, 20.0], [150.0, 200.0], [400.0, 20.0], [400.0, 200.0]])  # Pa, Pa s
 t_jam, x_jam = run(
@@ -362,7 +363,8 @@ def drawn(f):
 
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "flows.mp4"
-    render.save_video(path, map(drawn, range(frames + 1)), fps=12)
+    shown = range(0, frames + 1, 5 if FAST else 1)
+    render.save_video(path, map(drawn, shown), fps=12)
     video = Video(path.read_bytes(), embed=True, mimetype="video/mp4", width=640)
 plt.show()
 video

@@ -45,7 +45,7 @@ plt.rcParams |= {"figure.dpi": 80, "font.size": 11}
 
 # %%
 DENSITY, SPEED, NU = 1000.0, 4.0, 0.3
-h = 1 / 14 if FAST else 1 / 24
+h = 1 / 11 if FAST else 1 / 24
 grid = pgjax.Grid((-0.5, -0.5, -0.1), (round(1 / h), round(1 / h), round(0.9 / h)), h)
 x, volumes = sampling.ball((0, 0, 0.22), 0.15, spacing=h / 2)
 floor = boundary.Box((-9, -9, 0), (9, 9, 9), boundary.Separating(friction=0.3))
@@ -65,7 +65,7 @@ def start(scene):
 # traced.
 
 # %%
-stiffness = np.geomspace(3e4, 1e6, 8)  # E, Pa
+stiffness = np.geomspace(3e4, 3e5 if FAST else 1e6, 8)  # E, Pa
 strength = np.geomspace(1e3, 1e6, 8)  # τ_Y, Pa
 stiffest = scene(stiffness[-1], strength[-1])
 FRAME, FRAMES = 0.008, 20  # s

@@ -138,7 +138,7 @@ print("before training: E = {:.2e} Pa, ν = {:.2f}".format(*young(untrained)))
 h, NOISE = 1 / 15, 2e-4
 X, volumes = sampling.block((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), spacing=h / 2)
 grid = pgjax.Grid((-0.3, -0.3, -0.3), (9, 9, 9), h)
-FRAME, FRAMES = 0.008, 8  # s
+FRAME, FRAMES = 0.008, 6 if FAST else 8  # s
 rng = np.random.default_rng(1)
 rates = jnp.asarray(22 * rng.normal(size=(2 if FAST else 4, 3, 3)), jnp.float32)  # A, 1/s
 
@@ -176,7 +176,7 @@ def loss(law):
     return jnp.mean((wobbles(law, rates) - seen) ** 2) / NOISE**2
 
 
-STEPS = 60 if FAST else 300
+STEPS = 40 if FAST else 300
 schedule = optax.cosine_decay_schedule(0.1, STEPS, alpha=0.02)
 trained = descend(loss, untrained, steps=STEPS, optimizer=optax.adam(schedule))
 law = trained.best

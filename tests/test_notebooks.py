@@ -14,8 +14,8 @@ FOLDER = pathlib.Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("*.py"))
 each_notebook = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 
-# Of the processor, compiling included. A guard: four of them took 50 to 70 s on an idle
-# machine, and a busy one takes twice that.
+# Of the processor, compiling included. A guard: they took 35 to 55 s on an idle machine, and a
+# busy one takes twice that.
 SECONDS = 100
 # A forge does not show much more.
 LARGEST = 1_500_000

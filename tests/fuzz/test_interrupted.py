@@ -83,7 +83,9 @@ def limited(folder, out, fails):
     )
 
 
-@pytest.mark.parametrize(("fails", "frame"), [("frames", -1), ("video", 4)])
+@pytest.mark.parametrize(
+    ("fails", "frame"), [pytest.param("frames", -1, marks=pytest.mark.slow), ("video", 4)]
+)
 def test_a_full_disk_keeps_what_is_complete(folder, whole, tmp_path, fails, frame):
     out = tmp_path / "out"
     done = limited(folder, out, fails)

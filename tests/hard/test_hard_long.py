@@ -99,7 +99,13 @@ def spun(name, part, turns):
     return np.asarray(end.Fe, np.float64)[0], (C[1, 0] - C[0, 1]) / (2 * omega)
 
 
-@pytest.mark.parametrize("name", ["FixedCorotated", "StVKHencky", "NeoHookean"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "NeoHookean",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("FixedCorotated", "StVKHencky")),
+    ],
+)
 def test_h37_a_thousand_turns(name, holds):
     """What det(I + Δt W) > 1 adds in each step the stress takes back: the strain does not grow.
 

@@ -347,13 +347,8 @@ def frames_differ(material):
     return [np.linalg.norm(a) / np.linalg.norm(still) for a in (coarse, fine, 2 * fine - coarse)]
 
 
-@pytest.mark.parametrize(
-    "what",
-    [
-        pytest.param(what, marks=pytest.mark.slow) if what in ("paste", "metal") else what
-        for what in MOVED
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("what", MOVED)
 def test_v39_frame_indifference(measure, what):
     coarse, fine, limit = frames_differ(MOVED[what])
     measure("V39", f"order of the error of a turned frame, {what}", order(coarse, fine), **FIRST)

@@ -37,10 +37,8 @@ def test_v24_manufactured_solution(measure, d, name):
     measure("V24", f"rate from n = 16 to 32, {name}, {d}-D", rate, above=1.85)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["quadratic-grad", *(pytest.param(n, marks=pytest.mark.slow) for n in list(SCHEMES)[1:])],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCHEMES)
 def test_v24_manufactured_solution_in_three_dimensions(measure, name):
     rate = np.log2(manufactured.error(8, 3, name) / manufactured.error(16, 3, name))
     measure("V24", f"rate from n = 8 to 16, {name}, 3-D", rate, above=1.6)

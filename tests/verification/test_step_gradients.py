@@ -122,9 +122,10 @@ def all_finite(tree):
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("d", "degree"),
-    [pytest.param(3, 2, marks=pytest.mark.slow), (2, 3)],
+    [(3, 2), (2, 3)],
     ids=["3d-quadratic", "2d-cubic"],
 )
 def test_step_derivatives(d, degree, measure):
