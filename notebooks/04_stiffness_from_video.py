@@ -140,14 +140,16 @@ def filmed(name, x, F):
 
 @eqx.filter_jit
 def rollout(scene, state, substeps):
-    """Positions and deformations of all frames."""
+    """Positions and deformations of all frames, and which particles were not lost."""
     motion = pgjax.simulate(scene, state, dt=frame_dt / substeps, frames=frames, substeps=substeps)
-    return motion.saved.x, motion.saved.F
+    return motion.saved.x, motion.saved.F, motion.final.alive
 
 
 def played(build, values, substeps):
-    """The same for a `build` and values by name."""
-    return rollout(*build(jax.tree.map(jnp.float32, values)), substeps)
+    """The first two for a `build` and values by name."""
+    x, F, alive = rollout(*build(jax.tree.map(jnp.float32, values)), substeps)
+    assert bool(alive.all())
+    return x, F
 
 
 blank = Pictures(gaussians, camera, np.zeros((frames, pixels, pixels, 3)), background=white)

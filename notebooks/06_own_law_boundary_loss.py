@@ -237,7 +237,6 @@ def kept(state):
     return state.x, state.F
 
 
-@eqx.filter_jit
 def moved(scene):
     """Positions and deformations in all frames."""
     state = pgjax.initial_state(scene, x)

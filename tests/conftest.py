@@ -60,7 +60,7 @@ def spare_variants(items):
             continue
         if item.get_closest_marker("slow") or item.get_closest_marker("skip"):
             continue
-        if case in seen or "_fails_" in case:
+        if case in seen or (folder == "verification" and "_fails_" in case):
             item.add_marker(pytest.mark.slow)
         seen.add(case)
 

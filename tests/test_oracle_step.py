@@ -79,6 +79,18 @@ CASES = {
 }
 
 
+def rubbed(node, velocity, t):
+    """Coulomb friction on the half-space of `run_both`, without JAX."""
+    del t
+    normal = np.eye(len(node))[0] + 0.3
+    normal /= np.linalg.norm(normal)
+    pressing = velocity @ normal
+    if (node - 0.4) @ normal > 1e-12 or pressing >= 0:
+        return velocity
+    sliding = velocity - pressing * normal
+    return sliding * max(1 + 0.2 * pressing / np.linalg.norm(sliding), 0)
+
+
 def run_both(name, d, degree, scheme):
     material, stress, return_map, history = CASES[name]
     rng = np.random.default_rng(3)
@@ -106,16 +118,6 @@ def run_both(name, d, degree, scheme):
     )
     state = initial_state(scene, x, v, C=C, F=F)
 
-    def boundary(node, velocity, t):
-        """Coulomb friction on a half-space, without JAX."""
-        del t
-        normal = (np.eye(d)[0] + 0.3) / np.linalg.norm(np.eye(d)[0] + 0.3)
-        pressing = velocity @ normal
-        if (node - 0.4) @ normal > 1e-12 or pressing >= 0:
-            return velocity
-        sliding = velocity - pressing * normal
-        return sliding * max(1 + 0.2 * pressing / np.linalg.norm(sliding), 0)
-
     expected = oracle.State(
         x=x,
         v=v,
@@ -134,7 +136,7 @@ def run_both(name, d, degree, scheme):
         gravity=gravity,
         degree=degree,
         mls=isinstance(scheme, MLS),
-        boundary=boundary,
+        boundary=rubbed,
         damping=0.7,
         rpic=3.0,
     )
